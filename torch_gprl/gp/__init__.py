@@ -1,0 +1,17 @@
+"""Gaussian processes: the sparse online one, and the plain twins that it is tested against."""
+
+from torch_gprl.gp.exact import ExactGP
+from torch_gprl.gp.posterior import Posterior
+from torch_gprl.gp.pruning import BasisStatistics, InformationScore, PruningScore
+from torch_gprl.gp.recursion import RecursiveGP
+from torch_gprl.gp.sparse_online import SparseOnlineGP
+
+__all__ = [
+    "BasisStatistics",
+    "ExactGP",
+    "InformationScore",
+    "Posterior",
+    "PruningScore",
+    "RecursiveGP",
+    "SparseOnlineGP",
+]

@@ -1,0 +1,60 @@
+"""The door of a GP: data come in here, are cast to the model's dtype, and are turned away if they are bad."""
+
+import torch
+from torch import Tensor
+
+
+def admit_inputs(inputs: Tensor, batch_shape: torch.Size, like: Tensor) -> Tensor:
+    """Inputs [*batch, N, D] in the dtype of `like` [*batch, B, D], expanded to `batch_shape`.
+
+    Raises:
+        ValueError: the last two dimensions are not (points, input dimensions of the model), or the leading
+            ones do not broadcast to `batch_shape`.
+    """
+    dims = like.shape[-1]
+    if inputs.ndim < 2 or inputs.shape[-1] != dims or not _broadcasts(inputs.shape[:-2], batch_shape):
+        raise ValueError(
+            f"inputs must be [*{tuple(batch_shape)}, points, {dims}], got {tuple(inputs.shape)}; "
+            "a single point is inputs[..., None, :]"
+        )
+    return inputs.to(like.dtype).expand(*batch_shape, *inputs.shape[-2:])
+
+
+def admit_data(
+    inputs: Tensor, targets: Tensor, mask: Tensor | None, batch_shape: torch.Size, like: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Inputs, targets and mask for an update; entries that the mask leaves out may hold anything.
+
+    Raises:
+        ValueError: shapes that do not fit each other, NaN or infinity in data that count.
+    """
+    inputs = admit_inputs(inputs, batch_shape, like)
+    expected = inputs.shape[:-1]
+    for name, tensor in (("targets", targets), ("mask", mask)):
+        if tensor is not None and not _broadcasts(tensor.shape, expected):
+            raise ValueError(f"{name} must be {tuple(expected)}, one per input, got {tuple(tensor.shape)}")
+    targets = targets.to(like.dtype).expand(expected)
+    if mask is not None:
+        mask = mask.to(torch.bool).expand(expected)
+        inputs = torch.where(mask.unsqueeze(-1), inputs, 0.0)
+        targets = torch.where(mask, targets, 0.0)
+    if not bool(torch.isfinite(inputs.sum() + targets.sum())):  # one synchronisation; details only on failure
+        for name, tensor in (("inputs", inputs), ("targets", targets)):
+            _refuse_non_finite(name, tensor)
+    return inputs, targets, torch.ones_like(targets, dtype=torch.bool) if mask is None else mask
+
+
+def _broadcasts(shape: torch.Size, target: torch.Size) -> bool:
+    padded = (1,) * (len(target) - len(shape)) + tuple(shape)
+    return len(padded) == len(target) and all(a in (1, b) for a, b in zip(padded, target, strict=True))
+
+
+def _refuse_non_finite(name: str, tensor: Tensor) -> None:
+    bad = ~torch.isfinite(tensor)
+    if bool(bad.any()):
+        where = bad.nonzero()[0].tolist()
+        raise ValueError(
+            f"{name} must be finite: {int(bad.sum())} of {bad.numel()} values are not, the first is "
+            f"{tensor[tuple(where)].item()} at index {where}; the model is unchanged. "
+            "Usually the reward or the simulation diverged: drop those points with mask="
+        )

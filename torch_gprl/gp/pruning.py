@@ -1,0 +1,105 @@
+"""Which basis vectors may go, and what is left of the posterior when they do.
+
+Scores after Csató and Opper (2002, Neural Computation 14) and the thesis' equation (.13); the arithmetic of a
+deletion in whitened coordinates, where the basis values are u = L w and the posterior is w ~ N(A⁻¹b, A⁻¹).
+
+| paper | here | meaning |
+|---|---|---|
+| L | `gram_factor` | Cholesky factor of the Gram matrix of the basis |
+| A, b | `precision`, `information` | posterior precision of w, and precision times mean |
+| Q_ii | `gram_inverse_diagonal` | diagonal of K⁻¹ |
+| Q_ii + C_ii | `posterior_precision_diagonal` | diagonal of the inverse posterior covariance seen from the basis |
+"""
+
+from typing import Literal, NamedTuple, Protocol
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torch_gprl.linalg import cholesky
+
+
+class BasisStatistics(NamedTuple):
+    """What a pruning score may look at, each [*batch, B]; entries outside `mask` mean nothing."""
+
+    alpha: Float[Tensor, "*batch B"]
+    gram_inverse_diagonal: Float[Tensor, "*batch B"]
+    posterior_precision_diagonal: Float[Tensor, "*batch B"]
+    stamps: Int[Tensor, "*batch B"]
+    mask: Bool[Tensor, "*batch B"]
+
+
+class PruningScore(Protocol):
+    """Maps statistics of the basis to a score per basis vector; the smallest scores are deleted."""
+
+    def __call__(self, statistics: BasisStatistics) -> Float[Tensor, "*batch B"]:
+        """Score each basis vector."""
+        ...
+
+
+class InformationScore:
+    """How much the posterior changes when a basis vector goes.
+
+    `"mean"`: (α_i / Q_ii)², the squared change of the mean at the vector under marginal deletion (the robust
+    partner of `projection="moment"`). `"kl"`: α_i² / (Q_ii + C_ii), the Kullback-Leibler score of Csató and
+    Opper, which belongs to their conditioning deletion (`projection="dtc"`).
+    """
+
+    def __init__(self, kind: Literal["mean", "kl"] = "mean") -> None:
+        if kind not in ("mean", "kl"):
+            raise ValueError(f"an information score is 'mean' or 'kl', got {kind!r}")
+        self.kind = kind
+
+    def __call__(self, statistics: BasisStatistics) -> Float[Tensor, "*batch B"]:
+        """Score each basis vector [*batch, B]."""
+        if self.kind == "mean":
+            return (statistics.alpha / statistics.gram_inverse_diagonal).square()
+        return statistics.alpha.square() / statistics.posterior_precision_diagonal
+
+    def __repr__(self) -> str:
+        return f"InformationScore({self.kind!r})"
+
+
+class Whitened(NamedTuple):
+    """The state of a sparse GP that a deletion rewrites; see the module's table."""
+
+    gram_factor: Float[Tensor, "*batch B B"]
+    precision: Float[Tensor, "*batch B B"]
+    information: Float[Tensor, "*batch B"]
+
+
+def keep_first(
+    state: Whitened, order: Int[Tensor, "*batch B"], kept: int, projection: Literal["moment", "dtc"]
+) -> tuple[Whitened, Float[Tensor, "*batch"]]:
+    """Reorder the basis by `order` and delete every vector from position `kept` on.
+
+    With the kept values first, u = P L w = L' w' for an orthogonal w' = T w (one QR), and the deleted values
+    are the last entries of w'. `"moment"` marginalises them: the posterior of the kept values is unchanged.
+    `"dtc"` conditions them at their prior mean given the kept ones, Csató's toolbox form, overconfident.
+
+    Returns:
+        the state [*batch, kept, ...] and the change of the log evidence's constant, such that the evidence
+        stays what it was, [*batch].
+    """
+    index = order.unsqueeze(-1).expand_as(state.gram_factor)
+    orthogonal, upper = torch.linalg.qr(state.gram_factor.gather(-2, index).mT)  # P L = Rᵀ Qᵀ
+    sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0).to(upper.dtype)
+    gram_factor = (upper * sign.unsqueeze(-1)).mT[..., :kept, :kept]
+    rotation = orthogonal * sign.unsqueeze(-2)  # Tᵀ
+    precision = rotation.mT @ state.precision @ rotation  # T A Tᵀ
+    information = (rotation.mT @ state.information.unsqueeze(-1)).squeeze(-1)
+    left, left_information = precision[..., :kept, :kept], information[..., :kept]
+    if projection == "dtc":
+        return Whitened(gram_factor, left, left_information), torch.zeros_like(information[..., 0])
+    # Schur complement: A_kk − A_kd A_dd⁻¹ A_dk, b_k − A_kd A_dd⁻¹ b_d
+    gone_factor = cholesky(precision[..., kept:, kept:])
+    right = torch.cat([precision[..., kept:, :kept], information[..., kept:, None]], -1)
+    half = torch.linalg.solve_triangular(gone_factor, right, upper=False)
+    half_cross, half_information = half[..., :-1], half[..., -1:]
+    left = left - half_cross.mT @ half_cross
+    left = 0.5 * (left + left.mT)
+    left_information = left_information - (half_cross.mT @ half_information).squeeze(-1)
+    log_determinant = 2 * gone_factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    evidence = 0.5 * (half_information.square().sum((-2, -1)) - log_determinant)
+    return Whitened(gram_factor, left, left_information), evidence

@@ -1,0 +1,148 @@
+"""Checkpoints: whole states of a run, written so that a crash at any moment leaves a readable one.
+
+The container is TorchRL's (`torchrl.checkpoint`): one zip file with a manifest and checksums, written under a
+temporary name and renamed. Added here: tensors and plain numbers only (nothing in the file can run code), a
+comparison of shapes before anything is overwritten, and a flush to the disk.
+"""
+
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+from torchrl.checkpoint import (
+    Checkpoint,
+    CheckpointAdapter,
+    CheckpointError,
+    CheckpointRotation,
+    GlobalRNGState,
+)
+
+from torch_gprl.runs.errors import UserError
+
+KEPT = 2  # the newest, and the one before in case the newest was cut off by a crash
+
+
+class Stateful(Protocol):
+    """Anything with a state of tensors and plain numbers."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """The whole state."""
+        ...
+
+    def load_state_dict(self, state_dict: dict[str, Any], /) -> object:
+        """Take over a state."""
+        ...
+
+
+class Checkpoints:
+    """The checkpoints of one run, newest last; the last two are kept.
+
+    The states of the random number generators are saved and restored with every checkpoint.
+
+    Args:
+        directory: where the files lie.
+        components: what is saved, by name.
+    """
+
+    def __init__(self, directory: Path, **components: Stateful) -> None:
+        self._rotation = CheckpointRotation(directory, keep_last=KEPT)
+        self._checkpoint = Checkpoint(format="archive")
+        for name, component in {**components, "random_numbers": GlobalRNGState()}.items():
+            self._checkpoint.register(name, component, adapter=_PlainState())
+
+    def save(self, step: int) -> Path:
+        """Write a checkpoint and delete those before the last two.
+
+        Args:
+            step: orders the checkpoints, e.g. the number of the update.
+
+        Returns:
+            The new file.
+        """
+        path = self._rotation.save(self._checkpoint, step=step)
+        for place in (path, path.parent):  # the file's bytes, then its name
+            descriptor = os.open(place, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        return path
+
+    def latest(self) -> Path | None:
+        """The newest readable checkpoint, if there is one."""
+        return self._rotation.latest()
+
+    def load(self, path: Path) -> None:
+        """Restore all components from a file.
+
+        Raises:
+            UserError: if the file is missing, damaged, of another format, or of a run with other shapes.
+        """
+        try:
+            self._checkpoint.load(path)
+        except (CheckpointError, zipfile.BadZipFile, OSError, ValueError, KeyError, EOFError) as error:
+            reason = " ".join(str(error).split())
+            raise UserError(
+                f"cannot load checkpoint {path}: {reason} (the file must be whole and from a run with the"
+                " same options)"
+            ) from error
+
+
+class _PlainState(CheckpointAdapter):
+    """Saves a state with `torch.save` and loads nothing but tensors and plain values."""
+
+    adapter_id = "torch_gprl.state"
+    format_version = 1
+
+    def save(
+        self, component: Stateful, path: Path, *, args: tuple[Any, ...], kwargs: Mapping[str, Any]
+    ) -> None:
+        path.mkdir(parents=True)
+        torch.save(component.state_dict(), path / "state.pt")
+
+    def load(
+        self,
+        component: Stateful,
+        path: Path,
+        *,
+        map_location: object,
+        tensor_load_kwargs: Mapping[str, Any],
+        args: tuple[Any, ...],
+        kwargs: Mapping[str, Any],
+    ) -> None:
+        try:
+            saved = torch.load(path / "state.pt", map_location="cpu", weights_only=True)
+        except Exception as error:  # pickle and zip errors have no common class
+            raise CheckpointError("the stored tensors are damaged or not plain") from error
+        _compare(_tensors(saved), _tensors(component.state_dict()))
+        component.load_state_dict(saved)
+
+
+def _tensors(state: object, place: str = "") -> dict[str, Tensor]:
+    """All tensors of a nested state by their place in it."""
+    if isinstance(state, Tensor):
+        return {place.removeprefix("."): state}
+    if isinstance(state, Mapping):
+        items = list(state.items())
+    elif isinstance(state, list | tuple):
+        items = list(enumerate(state))
+    else:
+        return {}
+    return {name: tensor for key, item in items for name, tensor in _tensors(item, f"{place}.{key}").items()}
+
+
+def _compare(saved: Mapping[str, Tensor], present: Mapping[str, Tensor]) -> None:
+    """Refuse a state of another shape before it half overwrites this one.
+
+    Saved tensors that are not yet present pass: optimisers make theirs at the first step.
+    """
+    for name, tensor in present.items():
+        if name not in saved:
+            raise CheckpointError(f"it lacks {name}")
+        if saved[name].shape != tensor.shape:
+            expected, came = list(tensor.shape), list(saved[name].shape)
+            raise CheckpointError(f"{name} has shape {came}, this run needs {expected}")

@@ -1,0 +1,122 @@
+"""Pictures of a run: the learning curve, and a value function over a plane of states.
+
+Everything is drawn on `matplotlib.figure.Figure` objects, without pyplot and its global state: no display is
+needed and nothing has to be closed.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Num
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from torch_gprl.runs.intervals import bootstrap_interval
+
+FEWEST_FOR_INTERVAL = 5  # learners; a bootstrap of fewer is much too narrow
+COLOUR = "#1f4e8c"
+DOTS_PER_INCH = 200
+
+
+def learning_curve(
+    frames: Num[np.ndarray, " updates"],
+    returns: Float[np.ndarray, "updates learners"],
+    threshold: float | None = None,
+    title: str = "",
+) -> Figure:
+    """Mean return over learners against experience, each learner as a thin line.
+
+    The band is the 95 % bootstrap interval of the mean from five learners on, the range from the worst to the
+    best with fewer; the legend says which.
+
+    Args:
+        frames: environment steps per learner at each update.
+        returns: return of each learner at each update; NaN where there is none yet.
+        threshold: return that counts as solved, drawn as a line.
+        title: e.g. the task.
+    """
+    learners = returns.shape[1]
+    figure = Figure(figsize=(5.6, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    if learners > 1:
+        label, low, high = _band(returns)
+        axes.fill_between(frames, low, high, color=COLOUR, alpha=0.2, linewidth=0, label=label)
+        axes.plot(frames, returns, color=COLOUR, alpha=min(0.5, 4 / learners), linewidth=0.6)
+    label = f"mean of {learners} learners" if learners > 1 else "return"
+    axes.plot(frames, returns.mean(axis=1), color=COLOUR, linewidth=1.8, label=label)
+    if threshold is not None:
+        axes.axhline(threshold, color="0.35", linestyle="--", linewidth=1, label=f"solved: {threshold:g}")
+    axes.set(xlabel="environment steps per learner", ylabel="return per episode", title=title)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    _open_frame(axes)
+    axes.legend(frameon=False, fontsize="small", loc="best")
+    return figure
+
+
+def _band(
+    returns: Float[np.ndarray, "updates learners"],
+) -> tuple[str, Float[np.ndarray, " updates"], Float[np.ndarray, " updates"]]:
+    """Name, lower and upper edge of the band."""
+    if returns.shape[1] >= FEWEST_FOR_INTERVAL:
+        return "95 % bootstrap interval of the mean", *bootstrap_interval(returns)
+    return "worst to best learner", returns.min(axis=1), returns.max(axis=1)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A value function on a rectangular grid of a plane of states.
+
+    Attributes:
+        x, y: the grid's coordinates, in the units that `labels` names.
+        mean: posterior mean of the value, in units of the return.
+        stddev: posterior standard deviation of the value, in units of the return.
+        basis: the basis vectors' places on the plane; those outside the grid are not drawn.
+        labels: what x and y are, with their units.
+    """
+
+    x: Float[np.ndarray, " columns"]
+    y: Float[np.ndarray, " rows"]
+    mean: Float[np.ndarray, "rows columns"]
+    stddev: Float[np.ndarray, "rows columns"]
+    basis: Float[np.ndarray, "size 2"]
+    labels: tuple[str, str]
+
+
+def value_surface(surface: Surface, title: str = "") -> Figure:
+    """Two panels: V(s) = Q(s, f(s)), and how uncertain it is, with the basis vectors that carry it.
+
+    Args:
+        surface: what to draw.
+        title: e.g. the task.
+    """
+    figure = Figure(figsize=(9.2, 3.8), layout="constrained")
+    if title:
+        figure.suptitle(title)
+    panels = [
+        ("value V(s) = Q(s, f(s))", surface.mean, "viridis", "posterior mean"),
+        ("uncertainty of V(s)", surface.stddev, "magma", "posterior standard deviation"),
+    ]
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    for axes, (name, values, colours, unit) in zip((left, right), panels, strict=True):
+        mesh = axes.pcolormesh(surface.x, surface.y, values, cmap=colours, shading="gouraud", rasterized=True)
+        figure.colorbar(mesh, ax=axes, label=unit)
+        axes.scatter(*surface.basis.T, s=11, facecolor="white", edgecolor="black", linewidth=0.6)
+        axes.set(title=f"{name}", xlabel=surface.labels[0])
+        axes.set(xlim=surface.x[[0, -1]], ylim=surface.y[[0, -1]])
+        axes.title.set_size("medium")
+    left.set_ylabel(surface.labels[1])
+    figure.supxlabel(f"○ {len(surface.basis)} basis vectors", fontsize="small", color="0.3")
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure; the ending of the path says how (`.png`, `.pdf`, `.svg`)."""
+    figure.savefig(path, dpi=DOTS_PER_INCH)
+
+
+def _open_frame(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.margins(x=0)
+    axes.grid(alpha=0.25, linewidth=0.5)

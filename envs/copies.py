@@ -1,0 +1,160 @@
+"""Copies of a task, stepped together: the part that TorchRL's and Gymnasium's interfaces share.
+
+Everything here is flat: B copies over the simulator's one array, float64, on the CPU.
+"""
+
+import math
+import os
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from envs.noise import StepNoise
+from envs.philox import StartDraws, Streams
+from envs.task import Noise, State, Task
+
+COPIES_PER_THREAD = 64  # fewer copies than this are not worth waking another thread for
+
+
+@dataclass(frozen=True)
+class Options:
+    """How many copies of a task run, where, and with which changes to the task's defaults."""
+
+    learners: int = 1  # independent learners, the leading batch dimension
+    num_envs: int = 1  # environments of each learner
+    seed: int = 0
+    device: str | torch.device = "cpu"  # where outputs go; the simulation itself runs on the CPU
+    threads: int | None = None  # simulator threads; None: as many as the number of copies is worth
+    dtype: torch.dtype = torch.float32  # of observations, actions and rewards
+    horizon: int | None = None  # control steps until truncation; None: the task's
+    observation_noise: float | None = None  # standard deviations, see `Noise`; None: the task's
+    action_noise: float | None = None
+    velocity_noise: float | None = None
+    info: bool = False  # write the named parts of the reward under "info"
+    first_learner: int = 0  # index of the first learner: learner i of a batch, alone, is first_learner=i
+
+    def __post_init__(self) -> None:
+        for name, least in (
+            ("learners", 1),
+            ("num_envs", 1),
+            ("first_learner", 0),
+            ("horizon", 1),
+            ("threads", 1),
+        ):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"{name} must be at least {least}, not {value}")
+        for name in ("observation_noise", "action_noise", "velocity_noise"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value < math.inf:
+                raise ValueError(f"{name} is a standard deviation, at least 0 and finite, not {value}")
+
+
+class Step(NamedTuple):
+    """The outcome of a step, all [B] or [B, do]."""
+
+    observation: Tensor
+    reward: Tensor
+    parts: dict[str, Tensor]
+    terminated: Tensor
+    truncated: Tensor
+
+
+class Copies:
+    """B = learners · num_envs copies of a task.
+
+    Args:
+        task: the task.
+        options: how many, and with which noise.
+
+    Attributes:
+        state: live views of the positions and velocities.
+        steps: [B] control steps since each episode's start.
+        divergences: how many simulations have diverged so far.
+    """
+
+    def __init__(self, task: Task, options: Options) -> None:
+        self.task, self.options = task, options
+        self.size = options.learners * options.num_envs
+        self.all = np.arange(self.size)
+        self.low = torch.tensor(task.action_low, dtype=torch.float64)
+        self.high = torch.tensor(task.action_high, dtype=torch.float64)
+        self.steps = np.zeros(self.size, dtype=np.int64)
+        self.divergences = 0
+        self._horizon = task.horizon if options.horizon is None else options.horizon
+        self._physics = task.physics(self.size, _threads(options.threads, self.size))
+        self.state = State(self._physics.qpos, self._physics.qvel, self._physics.derived)
+        self._scale = _noise(task.noise, options)
+        self.seed(options.seed)
+
+    def seed(self, seed: int) -> None:
+        """Start all random streams anew; takes effect at the next reset."""
+        options = self.options
+        self._streams = Streams(seed, options.learners, options.num_envs, options.first_learner)
+        self._noise = None
+        if any(vars(self._scale).values()):
+            widths = (self.low.numel(), self.state.qvel.shape[1], self.task.observation(self.state).shape[1])
+            self._noise = StepNoise(self._streams, sum(widths))
+            self._widths = widths
+
+    def reset(self, rows: NDArray[np.intp]) -> None:
+        """Start new episodes in the copies `rows` [R]."""
+        self._streams.episode[rows] += np.uint64(1)
+        self.steps[rows] = 0
+        qpos, qvel = self.task.start(StartDraws(self._streams, rows))
+        self._physics.place(rows, qpos, qvel)
+        if self._noise is not None:
+            self._noise.refill(rows, self.steps[rows])
+
+    def observation(self) -> Float[Tensor, "B do"]:
+        """What the agent sees of the present state."""
+        observation = self.task.observation(self.state)
+        if self._scale.observation:
+            observation += self._scale.observation * self._draw()[2]
+        return observation
+
+    def step(self, action: Float[Tensor, "B da"]) -> Step:
+        """Advance every copy by one control step.
+
+        Args:
+            action: [B, da] finite commands in the actuators' units; noise is added, then they are clipped.
+        """
+        self.steps += 1
+        if self._scale.action:
+            action = action + self._scale.action * self._draw()[0]
+        action = torch.clamp(action.double(), self.low, self.high)
+        before = self._physics.advance(action)
+        if self._scale.velocity:
+            self.state.qvel.add_(self._draw()[1], alpha=self._scale.velocity)
+        diverged = self._physics.diverged()
+        if diverged is not None:
+            self._physics.restore(diverged)
+        reward, parts = self.task.reward(before, action, self.state)
+        terminated = self.task.terminated(self.state)
+        if diverged is not None:
+            self.divergences += int(diverged.sum())
+            terminated = terminated | diverged
+        truncated = torch.from_numpy(self.steps >= self._horizon)
+        return Step(self.observation(), reward, parts, terminated, truncated)
+
+    def _draw(self) -> tuple[Tensor, ...]:
+        """Standard normal numbers of the present step: for actions, velocities and observations."""
+        assert self._noise is not None
+        return self._noise.at(self.steps).split(self._widths, dim=1)
+
+
+def _noise(default: Noise, options: Options) -> Noise:
+    chosen = (options.observation_noise, options.action_noise, options.velocity_noise)
+    defaults = (default.observation, default.action, default.velocity)
+    return Noise(*(std if value is None else value for value, std in zip(chosen, defaults, strict=True)))
+
+
+def _threads(threads: int | None, copies: int) -> int:
+    if threads is not None:
+        return threads
+    return max(1, min(len(os.sched_getaffinity(0)), copies // COPIES_PER_THREAD))

@@ -1,0 +1,147 @@
+"""The simulators: B copies of one system, advanced together over one shared array.
+
+MuJoCo's `Batch` steps all copies over one `(B, nstate)` float64 array, bit for bit as a loop over single
+simulations would, on any number of threads; torch views the same memory.
+"""
+
+import abc
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import mujoco.batch
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+LARGEST = 1e10  # beyond it MuJoCo calls a state divergent (mjMAXVAL)
+BAD_STATE = [
+    int(mujoco.mjtWarning.mjWARN_BADQPOS),
+    int(mujoco.mjtWarning.mjWARN_BADQVEL),
+    int(mujoco.mjtWarning.mjWARN_BADQACC),
+]
+
+
+class State(NamedTuple):
+    """The state of B simulations.
+
+    Attributes:
+        qpos: [B, nq] generalised positions, m or rad.
+        qvel: [B, nv] generalised velocities, m/s or rad/s.
+        derived: what the task asked of the simulator beyond them, name -> [B, ...].
+    """
+
+    qpos: Tensor
+    qvel: Tensor
+    derived: Mapping[str, Tensor] = {}
+
+
+class Physics(abc.ABC):
+    """B copies of a system.
+
+    Attributes:
+        qpos: [B, nq] float64, a live view of the simulator's memory: read it between steps, copy it to keep it.
+        qvel: [B, nv] float64, likewise.
+        derived: further live views, name -> [B, ...].
+    """
+
+    qpos: Tensor
+    qvel: Tensor
+    derived: dict[str, Tensor]
+
+    @abc.abstractmethod
+    def advance(self, control: Float[Tensor, "B nu"]) -> State:
+        """Advance every copy by one control step under a constant control.
+
+        Returns:
+            The state before the step, valid until the next one.
+        """
+
+    @abc.abstractmethod
+    def place(self, rows: NDArray[np.intp], qpos: Float[Tensor, "R nq"], qvel: Float[Tensor, "R nv"]) -> None:
+        """Put the copies `rows` into new states and forget their past."""
+
+    @abc.abstractmethod
+    def diverged(self) -> Bool[Tensor, " B"] | None:
+        """Where the last step ended in no usable state, or None where all is well."""
+
+    @abc.abstractmethod
+    def restore(self, rows: Bool[Tensor, " B"]) -> None:
+        """Undo the last step of the copies `rows`."""
+
+
+class MujocoPhysics(Physics):
+    """Copies of a MuJoCo model.
+
+    Args:
+        model: the model to step.
+        copies: how many, B.
+        substeps: physics steps in a control step.
+        threads: threads to step on; results do not depend on it.
+        derived: names of MjData fields to keep beside positions and velocities; as after `mj_step`, they
+            lag behind by one physics step.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, copies: int, substeps: int, threads: int, derived: tuple[str, ...] = ()
+    ) -> None:
+        self.model = model
+        self.batch = mujoco.batch.Batch(model, copies, nthread=threads)
+        self._substeps = substeps
+        self._rows = torch.from_numpy(self.batch.state)
+        self._before = self._rows.clone()
+        qpos, qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self.qpos, self.qvel = torch.from_numpy(qpos), torch.from_numpy(qvel)
+        self._past = State(
+            *(
+                self._before.as_strided(x.shape, x.stride(), x.storage_offset())
+                for x in (self.qpos, self.qvel)
+            )
+        )
+        self._control = torch.from_numpy(self.batch.bind("ctrl"))
+        self.derived = {name: torch.from_numpy(self.batch.bind(name)) for name in derived}
+
+    def advance(self, control: Float[Tensor, "B nu"]) -> State:
+        """Advance every copy by `substeps` physics steps; see `Physics.advance`."""
+        self._before.copy_(self._rows)
+        self._control.copy_(control)
+        self.batch.step(nstep=self._substeps)
+        return self._past
+
+    def place(self, rows: NDArray[np.intp], qpos: Float[Tensor, "R nq"], qvel: Float[Tensor, "R nv"]) -> None:
+        """Reset copies and compute what follows from their new states; see `Physics.place`."""
+        self.batch.reset(rows, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        index = torch.from_numpy(rows)
+        self.qpos[index] = qpos
+        self.qvel[index] = qvel
+        self.batch.forward(rows)
+
+    def diverged(self) -> Bool[Tensor, " B"] | None:
+        """Where MuJoCo had to reset a copy, or left it beyond `LARGEST`; see `Physics.diverged`."""
+        largest = np.abs(self.batch.state).max()
+        if largest <= LARGEST and not self.batch.warning.any():  # NaN fails the first test
+            return None
+        bad = (self.batch.warning[:, BAD_STATE, 1] > 0).any(axis=1)
+        self.batch.warning[:] = 0
+        bad |= ~(np.abs(self.batch.state).max(axis=1) <= LARGEST)
+        return torch.from_numpy(bad) if bad.any() else None
+
+    def restore(self, rows: Bool[Tensor, " B"]) -> None:
+        """Put back the state before the last step; see `Physics.restore`."""
+        self._rows[rows] = self._before[rows]
+
+
+def stripped(path: Path) -> mujoco.MjModel:
+    """The model of a file without what only the eye needs: geoms, lights, cameras, sites, drawn ropes.
+
+    Only for models without contacts whose bodies give their inertia explicitly. Trajectories are those of the
+    whole model to the last bit; a step is cheaper because nothing is placed that nobody looks at.
+    """
+    spec = mujoco.MjSpec.from_file(str(path))
+    for group in (spec.geoms, spec.lights, spec.cameras, spec.tendons, spec.sites):
+        for element in group:
+            spec.delete(element)
+    return spec.compile()

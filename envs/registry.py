@@ -1,0 +1,38 @@
+"""The list of tasks, and `make`, which turns one into an environment."""
+
+import difflib
+from typing import Any
+
+from envs import pendulum
+from envs.batch import BatchEnv
+from envs.copies import Options
+from envs.task import Task
+
+ALL: dict[str, Task] = {task.id: task for task in (*pendulum.TASKS,)}
+
+
+def find(task_id: str) -> Task:
+    """The task of that id.
+
+    Raises:
+        ValueError: if there is none; the message names the nearest and all.
+    """
+    if task_id in ALL:
+        return ALL[task_id]
+    near = difflib.get_close_matches(task_id, ALL, n=1, cutoff=0.3)
+    hint = f"; did you mean {near[0]!r}?" if near else ";"
+    raise ValueError(f"unknown task {task_id!r}{hint} Choose one of {', '.join(ALL)}")
+
+
+def make(task_id: str, **options: Any) -> BatchEnv:
+    """A TorchRL environment of batch `[learners, num_envs]`.
+
+    Args:
+        task_id: a key of `ALL`, for example "pendulum-swingup".
+        **options: the fields of `Options`: learners, num_envs, seed, device, threads, dtype, horizon,
+            observation_noise, action_noise, velocity_noise, info, first_learner.
+
+    Raises:
+        ValueError: if the task is unknown or an option is out of its range.
+    """
+    return BatchEnv(find(task_id), Options(**options))

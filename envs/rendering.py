@@ -1,0 +1,133 @@
+"""Pictures of a simulation: by OpenGL where the machine has it, by a plain drawing where it has not.
+
+`Picture` holds the full model of a task (the simulated one is stripped of what only the eye needs), puts a
+state into it and draws. OpenGL without a screen comes from EGL or OSMesa; `MUJOCO_GL` (egl, osmesa, glfw, or
+disable) overrides the choice.
+"""
+
+import ctypes
+import importlib
+import os
+import warnings
+from collections.abc import Callable
+from typing import Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.drawing import Sketch
+
+LIBRARIES = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}  # platform -> what it loads
+MAX_GEOMS = 1000
+CAMERA = "view"  # the camera of a model that shows the task; without it, MuJoCo's free camera
+
+NO_OPENGL = (
+    "no OpenGL library for drawing without a screen, so frames are plain sketches ({reason}); "
+    "for the full picture on Debian or Ubuntu: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri, "
+    "then run with MUJOCO_GL=egl"
+)
+
+
+class Drawing(Protocol):
+    """Something that turns a scene into pixels."""
+
+    def frame(self, scene: mujoco.MjvScene) -> NDArray[np.uint8]:
+        """[height, width, 3] pixels."""
+        ...
+
+
+class OpenGL:
+    """Drawing by MuJoCo's renderer into an invisible buffer.
+
+    Raises:
+        OSError, ImportError, RuntimeError, AttributeError: where the machine cannot do it; which of them
+            depends on what is missing.
+    """
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+        platform = os.environ.get("MUJOCO_GL", "").lower() or _platform()
+        if platform not in ("egl", "osmesa", "glfw"):
+            raise OSError(f"MUJOCO_GL={platform}")
+        self._gl = importlib.import_module(f"mujoco.{platform}").GLContext(width, height)
+        self._gl.make_current()
+        model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
+        model.vis.global_.offheight = max(model.vis.global_.offheight, height)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._viewport = mujoco.MjrRect(0, 0, width, height)
+
+    def frame(self, scene: mujoco.MjvScene) -> NDArray[np.uint8]:
+        """[height, width, 3] pixels."""
+        self._gl.make_current()
+        pixels = np.empty((self._viewport.height, self._viewport.width, 3), dtype=np.uint8)
+        mujoco.mjr_render(self._viewport, scene, self._context)
+        mujoco.mjr_readPixels(pixels, None, self._viewport, self._context)
+        return pixels[::-1].copy()  # OpenGL's first row is the lowest
+
+
+def _platform() -> str:
+    """The first platform whose library loads.
+
+    Raises:
+        OSError: if none does.
+    """
+    for platform, library in LIBRARIES.items():
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            continue
+        return platform
+    raise OSError(f"neither {' nor '.join(LIBRARIES.values())} can be loaded")
+
+
+class Picture:
+    """Draws states of a model.
+
+    Args:
+        model: the full model, with geoms, lights and cameras.
+        pose: puts positions [nq] into the model's data, with whatever only the eye needs.
+        width, height: size in pixels.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        pose: Callable[[mujoco.MjModel, mujoco.MjData, NDArray[np.float64]], None],
+        width: int,
+        height: int,
+    ) -> None:
+        self._model, self._pose = model, pose
+        self._data = mujoco.MjData(model)
+        self._scene = mujoco.MjvScene(model, MAX_GEOMS)
+        self._camera = mujoco.MjvCamera()
+        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, CAMERA) >= 0:
+            self._camera.fixedcamid = model.camera(CAMERA).id
+            self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        else:
+            mujoco.mjv_defaultFreeCamera(model, self._camera)
+        self._drawing = drawing(model, width, height)
+
+    def frame(self, qpos: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """The picture of positions [nq]: [height, width, 3] pixels."""
+        self._pose(self._model, self._data, qpos)
+        mujoco.mj_forward(self._model, self._data)
+        mujoco.mjv_updateScene(
+            self._model,
+            self._data,
+            mujoco.MjvOption(),
+            None,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value,
+            self._scene,
+        )
+        return self._drawing.frame(self._scene)
+
+
+def drawing(model: mujoco.MjModel, width: int, height: int) -> Drawing:
+    """OpenGL if it works here, else a sketch and, once a process, a warning that says how to get OpenGL."""
+    try:
+        return OpenGL(model, width, height)
+    except (OSError, ImportError, RuntimeError, AttributeError, mujoco.FatalError) as error:
+        warnings.warn(NO_OPENGL.format(reason=error), stacklevel=2)
+        return Sketch(width, height)

@@ -1,0 +1,98 @@
+"""What a task is: pure batched functions of the state, and the numbers that fix the problem.
+
+A task holds no state and steps no simulator: `physics.py` moves the state, `batch.py` calls the functions here
+once a control step and wraps the results for TorchRL.
+"""
+
+import abc
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from envs.philox import StartDraws
+from envs.physics import Physics, State
+
+
+class Reward(NamedTuple):
+    """A reward [B] and its named parts [B], for plots and for finding out what an agent is after."""
+
+    total: Tensor
+    parts: dict[str, Tensor]
+
+    @classmethod
+    def of(cls, **parts: Tensor) -> "Reward":
+        """The sum of the parts, in the order given."""
+        return cls(sum(parts.values(), start=torch.zeros(())), parts)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of the normal noise of each control step."""
+
+    observation: float = 0.0  # added to every entry of the observation, in its unit
+    action: float = 0.0  # added to the action before it is clipped to the actuator's bounds, in its unit
+    velocity: float = 0.0  # added to every generalised velocity after the step, m/s or rad/s
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A picture plane: two coordinates that fix the whole observation, for maps of value functions.
+
+    Attributes:
+        labels: names of the coordinates, with units.
+        low, high: the range to draw.
+        to_observation: points [..., 2] -> observations [..., do].
+        from_observation: observations [..., do] -> points [..., 2].
+    """
+
+    labels: tuple[str, str]
+    low: tuple[float, float]
+    high: tuple[float, float]
+    to_observation: Callable[[Tensor], Tensor]
+    from_observation: Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task(abc.ABC):
+    """A control problem. Subclasses define the functions, instances the numbers."""
+
+    id: str
+    horizon: int  # control steps until an episode is truncated
+    control_step: float  # s between actions
+    action_low: tuple[float, ...]  # bounds of the actuators, in their units
+    action_high: tuple[float, ...]
+    noise: Noise = field(default_factory=Noise)
+    plane: Plane | None = None
+    scene: Path  # the MuJoCo model to draw
+
+    @abc.abstractmethod
+    def physics(self, copies: int, threads: int) -> Physics:
+        """A simulator of `copies` independent copies on `threads` threads."""
+
+    @abc.abstractmethod
+    def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R nq"], Float[Tensor, "R nv"]]:
+        """Draw the positions and velocities that R episodes start from."""
+
+    @abc.abstractmethod
+    def observation(self, state: State) -> Float[Tensor, "B do"]:
+        """What the agent sees, in a new tensor."""
+
+    @abc.abstractmethod
+    def reward(self, before: State, action: Float[Tensor, "B da"], after: State) -> Reward:
+        """The reward of a step, from the states around it and the action that was applied."""
+
+    def pose(self, model: mujoco.MjModel, data: mujoco.MjData, qpos: NDArray[np.float64]) -> None:
+        """Put positions [nq] into the model that is drawn, with whatever only the eye needs."""
+        data.qpos[:] = qpos
+
+    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+        """Where the episode is over for good; never, unless a task says otherwise. Time limits are not its business."""
+        return torch.zeros(len(state.qpos), dtype=torch.bool)

@@ -6,8 +6,9 @@ import torch
 from jaxtyping import install_import_hook
 
 # Has to run before the first import of torch_gprl. It stays out of the library itself: with the hook
-# installed torch.compile refuses the functions.
-install_import_hook("torch_gprl", "beartype.beartype")
+# installed torch.compile refuses the functions. The tower lets an int stand where a float is asked for, as
+# PEP 484 and pyright do.
+install_import_hook("torch_gprl", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 
 torch.set_num_threads(1)
 

@@ -56,18 +56,18 @@ def _refuse_non_finite(matrix: Tensor) -> None:
     bad = ~matrix.isfinite()
     if bad.any():
         raise CholeskyError(
-            f"cholesky needs finite numbers, got {int(bad.sum())} NaN or infinite entries in a matrix of "
-            f"shape {tuple(matrix.shape)}, {matrix.dtype}; look for NaN in the inputs, or for a length scale, "
-            "output scale or noise variance that ran off to 0 or infinity"
+            f"cholesky needs finite numbers, got {int(bad.sum())} NaN or infinite ones in a matrix of shape "
+            f"{tuple(matrix.shape)}, {matrix.dtype}; look for NaN in the inputs, or for a length scale, output "
+            "scale or noise variance that ran off to 0 or infinity"
         )
 
 
 def _not_positive_definite(matrix: Tensor, info: Tensor, limit: float) -> str:
     first = matrix.reshape(-1, *matrix.shape[-2:])[int(info.reshape(-1).nonzero()[0])].detach()
     return (
-        f"cholesky needs a positive definite matrix, got {int((info > 0).sum())} that are not; the first "
-        f"has size {matrix.shape[-1]}, {matrix.dtype}, mean diagonal {float(first.diagonal().mean()):.3g} and "
-        f"smallest eigenvalue {float(torch.linalg.eigvalsh(first)[0]):.3g}; jitter tried up to {limit:.1g} "
-        "of the mean diagonal; use float64, raise the noise variance or the novelty threshold, drop "
+        f"cholesky needs positive definite matrices, got {int((info > 0).sum())} that are not; the first has "
+        f"size {matrix.shape[-1]}, {matrix.dtype}, mean diagonal {float(first.diagonal().mean()):.3g} and "
+        f"smallest eigenvalue {float(torch.linalg.eigvalsh(first)[0]):.3g}; jitter tried up to {limit:.1g} of "
+        "the mean diagonal; use float64, raise the noise variance or the novelty threshold, drop "
         "near-duplicate points, or check that the kernel is positive semi-definite"
     )

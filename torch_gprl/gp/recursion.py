@@ -29,6 +29,16 @@ class RecursiveGP:
 
     A point joins the basis if its novelty exceeds `novelty_threshold · noise_variance`; if the basis is then
     over budget, the vector of smallest score leaves. Unbatched, without gradients.
+
+    Args:
+        kernel: prior covariance.
+        budget: most basis vectors allowed.
+        noise_variance: variance of the noise on targets.
+        novelty_threshold: novelty above which a point joins the basis, in noise variances.
+        projection: "moment" keeps the exact marginal posterior of the basis values where a point is projected
+            or a vector deleted; "dtc" predicts the value that goes from the basis, as if without residual.
+        score: loss by a vector's deletion; "mean" is (α_i/K⁻¹_ii)², the squared change of the mean there, "kl"
+            is α_i²/(K⁻¹_ii + C_ii).
     """
 
     def __init__(
@@ -40,19 +50,6 @@ class RecursiveGP:
         projection: Literal["moment", "dtc"] = "moment",
         score: Literal["mean", "kl"] = "mean",
     ) -> None:
-        """Start from the prior.
-
-        Args:
-            kernel: prior covariance.
-            budget: most basis vectors allowed.
-            noise_variance: variance of the noise on targets.
-            novelty_threshold: novelty at which a point joins the basis, in noise variances.
-            projection: "moment" keeps the exact marginal posterior of the basis values when a point is
-                projected or a vector deleted; "dtc" keeps the likelihood and lets f lean on the basis without
-                residual.
-            score: loss of a vector's deletion: "mean" is (α_i/K⁻¹_ii)², the squared change of the mean there;
-                "kl" is α_i²/(K⁻¹_ii + C_ii).
-        """
         self.kernel = kernel
         self.budget = budget
         self.noise_variance = noise_variance
@@ -60,7 +57,7 @@ class RecursiveGP:
         self.projection = projection
         self.score = score
         like = next(kernel.parameters())
-        self.basis = like.new_zeros(0, kernel.input_dim, requires_grad=False)
+        self.basis = like.new_zeros(0, kernel.input_dim)
         self.alpha = like.new_zeros(0)
         self.C = like.new_zeros(0, 0)
         self.gram_inverse = like.new_zeros(0, 0)

@@ -1,6 +1,25 @@
 """Kernels: covariance functions, batched over independent learners, differentiable in all that they take."""
 
-from torch_gprl.kernels.base import Kernel
-from torch_gprl.kernels.stationary import Matern, SquaredExponential
+from torch_gprl.kernels.base import Kernel, Product, Scaled, Sum
+from torch_gprl.kernels.columns import Columns
+from torch_gprl.kernels.gaussian_inputs import GaussianInputs
+from torch_gprl.kernels.gpytorch import GPyTorchKernel
+from torch_gprl.kernels.linear import Linear
+from torch_gprl.kernels.parameters import Positive
+from torch_gprl.kernels.stationary import Matern, Periodic, RationalQuadratic, SquaredExponential
 
-__all__ = ["Kernel", "Matern", "SquaredExponential"]
+__all__ = [
+    "Columns",
+    "GPyTorchKernel",
+    "GaussianInputs",
+    "Kernel",
+    "Linear",
+    "Matern",
+    "Periodic",
+    "Positive",
+    "Product",
+    "RationalQuadratic",
+    "Scaled",
+    "SquaredExponential",
+    "Sum",
+]

@@ -1,34 +1,39 @@
-"""What a kernel is: a covariance function with positive parameters, batched over independent learners.
+"""What a kernel is, and the algebra of kernels: sums, products and multiples are kernels again.
 
-Rasmussen and Williams (2006), Gaussian Processes for Machine Learning, chapter 4.
+Rasmussen and Williams (2006), Gaussian Processes for Machine Learning, section 4.2.4. A kernel is a
+covariance function with positive parameters, batched over independent learners.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import reduce
+from operator import add, mul
 
 import torch
 from torch import Tensor, nn
+from torch.distributions import Distribution
 
+from torch_gprl.kernels.gaussian_inputs import GaussianInputs
+from torch_gprl.kernels.parameters import Positive, PositiveValue, log_parameter
 from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
 
 
 class Kernel(nn.Module, ABC):
     """A covariance function k(x, z), differentiable in its inputs and its parameters.
 
-    `batch_shape` is the shape of independent hyper-parameters, one set per learner. It broadcasts against the
-    leading dimensions of the inputs: a kernel of batch_shape () serves batched inputs too.
+    `k1 + k2`, `k1 * k2` and `2.0 * k` are kernels too. Parameters are float64 until `.to()` says otherwise.
+
+    Args:
+        input_dim: number of input columns D.
+        batch_shape: independent hyper-parameters, one set per learner. It broadcasts against the leading
+            dimensions of the inputs: a kernel of batch_shape () serves batched inputs too.
     """
 
     def __init__(self, input_dim: int, batch_shape: Sequence[int] = ()) -> None:
-        """Keep the shapes.
-
-        Args:
-            input_dim: number of input columns that the kernel takes.
-            batch_shape: independent hyper-parameters, one set per learner.
-        """
         super().__init__()
         self.input_dim = input_dim
         self.batch_shape = torch.Size(batch_shape)
+        self.priors: dict[str, Distribution] = {}
 
     @abstractmethod
     def forward(self, x: Inputs, z: OtherInputs) -> CrossMatrix:
@@ -38,39 +43,161 @@ class Kernel(nn.Module, ABC):
     def diag(self, x: Inputs) -> PerPoint:
         """Prior variance k(x, x) of every row of x [*batch, N, D]: [*batch, N]."""
 
+    @property
+    def active_columns(self) -> frozenset[int]:
+        """The input columns on which the kernel depends."""
+        return frozenset(range(self.input_dim))
 
-class Positive:
-    """A positive parameter `name` of a module, kept as the unconstrained `log_name`.
+    def expected(self, x: GaussianInputs, z: OtherInputs | GaussianInputs) -> CrossMatrix:
+        """E[k(x, z)] over the Gaussian columns of x, and of z where it has some: [*batch, N, M].
 
-    Reading gives exp(log_name), differentiable; assigning copies into it, broadcasting, and leaves the
-    parameter object, and hence an optimiser that holds it, in place.
+        This is the covariance of averages: E_a[k((s, a), z)] is that of E_a[f(s, a)] with f(z). Rows of x and
+        of z count as independent draws, even where they are the same rows, as the variance of an average
+        wants it. For pairs (x_i, z_i) alone, put the points in the batch: means [N, 1, D]. Differentiable in
+        means and variances.
+
+        Raises:
+            NotImplementedError: no closed form; squared exponential and linear kernels have one, and so have
+                sums and products of them with kernels on other columns.
+        """
+        other = z if isinstance(z, GaussianInputs) else GaussianInputs.exactly(z)
+        if x.columns or other.columns:
+            return self._expected(x, other)
+        return self(x.mean, other.mean)
+
+    def _expected(self, x: GaussianInputs, z: GaussianInputs) -> Tensor:
+        raise NotImplementedError(
+            f"{type(self).__name__} has no closed form average over Gaussian columns; use "
+            "SquaredExponential or Linear on these columns, in a product by Columns with any kernel on the others"
+        )
+
+    def set_prior(self, name: str, prior: Distribution) -> None:
+        """Put a prior on a positive parameter of this kernel; `log_prior` adds its log density.
+
+        Args:
+            name: the parameter, such as "lengthscale".
+            prior: distribution of its value (not of its logarithm), broadcast over its shape. `.to()` does
+                not move it: give it numbers, or tensors on the right device.
+
+        Raises:
+            ValueError: this kernel has no such parameter.
+        """
+        attributes = {key: value for owner in type(self).__mro__ for key, value in vars(owner).items()}
+        owned = sorted(key for key, value in attributes.items() if isinstance(value, Positive))
+        if name not in owned:
+            raise ValueError(
+                f"{type(self).__name__} has no positive parameter {name!r}; choose one of {owned}"
+            )
+        self.priors[name] = prior
+
+    def log_prior(self) -> Tensor:
+        """Log density of all parameters with a prior, of this kernel and of its parts: [*batch_shape]."""
+        total = torch.zeros(self.batch_shape, dtype=torch.float64)
+        for kernel in self.modules():
+            if isinstance(kernel, Kernel):
+                for name, prior in kernel.priors.items():
+                    log_density = prior.log_prob(getattr(kernel, name))
+                    total = total.to(log_density) + log_density.reshape(*kernel.batch_shape, -1).sum(-1)
+        return total
+
+    def __add__(self, other: "Kernel") -> "Kernel":
+        return Sum(self, other)
+
+    def __mul__(self, other: "Kernel | float") -> "Kernel":
+        return Product(self, other) if isinstance(other, Kernel) else Scaled(self, other)
+
+    __rmul__ = __mul__
+
+
+class Scaled(Kernel):
+    """A multiple of a kernel, by the positive parameter `outputscale`.
+
+    Args:
+        kernel: the kernel to scale.
+        outputscale: the factor, in squared units of the targets; broadcasts to the kernel's batch_shape.
     """
 
-    def __set_name__(self, owner: type, name: str) -> None:
-        """Learn the name under which the owner knows the parameter."""
-        self.name = name
+    outputscale = Positive()
 
-    def __get__(self, module: nn.Module, owner: type | None = None) -> Tensor:
-        """The positive value."""
-        return getattr(module, f"log_{self.name}").exp()
+    def __init__(self, kernel: Kernel, outputscale: PositiveValue = 1.0) -> None:
+        super().__init__(kernel.input_dim, kernel.batch_shape)
+        self.kernel = kernel
+        self.log_outputscale = log_parameter(outputscale, "outputscale", self.batch_shape)
 
-    def __set__(self, module: nn.Module, value: Tensor | float) -> None:
-        """Copy a positive value in; raises ValueError on one that is not."""
-        log_value = getattr(module, f"log_{self.name}")
-        with torch.no_grad():
-            log_value.copy_(positive(value, self.name).log())
+    @property
+    def active_columns(self) -> frozenset[int]:
+        """The input columns on which the kernel depends."""
+        return self.kernel.active_columns
+
+    def forward(self, x: Inputs, z: OtherInputs) -> CrossMatrix:
+        """Covariance of x [*batch, N, D] with z [*batch, M, D]: [*batch, N, M]."""
+        return self.outputscale[..., None, None] * self.kernel(x, z)
+
+    def diag(self, x: Inputs) -> PerPoint:
+        """Prior variance at x [*batch, N, D]: [*batch, N]."""
+        return self.outputscale[..., None] * self.kernel.diag(x)
+
+    def _expected(self, x: GaussianInputs, z: GaussianInputs) -> Tensor:
+        return self.outputscale[..., None, None] * self.kernel.expected(x, z)
 
 
-def log_parameter(value: Tensor | float, name: str, shape: Sequence[int]) -> nn.Parameter:
-    """The logarithm of a positive value, broadcast to a shape, as a float64 parameter."""
-    return nn.Parameter(positive(value, name).log().expand(torch.Size(shape)).clone())
+class _Composite(Kernel):
+    """Several kernels on the same inputs; their batch shapes broadcast."""
+
+    def __init__(self, *kernels: Kernel) -> None:
+        dims = {kernel.input_dim for kernel in kernels}
+        if len(dims) != 1:
+            raise ValueError(
+                f"{type(self).__name__} needs kernels of one input_dim, got "
+                f"{[kernel.input_dim for kernel in kernels]}; Columns(kernel, columns, input_dim) puts a kernel on some columns of wider inputs"
+            )
+        super().__init__(dims.pop(), torch.broadcast_shapes(*(kernel.batch_shape for kernel in kernels)))
+        self.kernels = nn.ModuleList(kernels)
+
+    @property
+    def active_columns(self) -> frozenset[int]:
+        """The input columns on which any part depends."""
+        return frozenset().union(*(kernel.active_columns for kernel in self.parts))
+
+    @property
+    def parts(self) -> list[Kernel]:
+        """The kernels that it is made of."""
+        return [kernel for kernel in self.kernels if isinstance(kernel, Kernel)]
 
 
-def positive(value: Tensor | float, name: str) -> Tensor:
-    """The value as a detached float64 tensor; raises ValueError if any of it is not positive and finite."""
-    tensor = torch.as_tensor(value, dtype=torch.float64).detach()
-    if not ((tensor > 0) & tensor.isfinite()).all():
-        raise ValueError(
-            f"{name} must be positive and finite, got {tensor.tolist()}; give numbers above zero"
-        )
-    return tensor
+class Sum(_Composite):
+    """k₁ + k₂ + …: the covariance of a sum of independent functions."""
+
+    def forward(self, x: Inputs, z: OtherInputs) -> CrossMatrix:
+        """Covariance of x [*batch, N, D] with z [*batch, M, D]: [*batch, N, M]."""
+        return reduce(add, (kernel(x, z) for kernel in self.parts))
+
+    def diag(self, x: Inputs) -> PerPoint:
+        """Prior variance at x [*batch, N, D]: [*batch, N]."""
+        return reduce(add, (kernel.diag(x) for kernel in self.parts))
+
+    def _expected(self, x: GaussianInputs, z: GaussianInputs) -> Tensor:
+        return reduce(add, (kernel.expected(x, z) for kernel in self.parts))
+
+
+class Product(_Composite):
+    """k₁ · k₂ · …: the covariance of a product of independent functions."""
+
+    def forward(self, x: Inputs, z: OtherInputs) -> CrossMatrix:
+        """Covariance of x [*batch, N, D] with z [*batch, M, D]: [*batch, N, M]."""
+        return reduce(mul, (kernel(x, z) for kernel in self.parts))
+
+    def diag(self, x: Inputs) -> PerPoint:
+        """Prior variance at x [*batch, N, D]: [*batch, N]."""
+        return reduce(mul, (kernel.diag(x) for kernel in self.parts))
+
+    def _expected(self, x: GaussianInputs, z: GaussianInputs) -> Tensor:
+        # the average of a product is the product of averages only over independent, hence separate, columns
+        for column in {*x.columns, *z.columns}:
+            users = [type(kernel).__name__ for kernel in self.parts if column in kernel.active_columns]
+            if len(users) > 1:
+                raise NotImplementedError(
+                    f"a product has a closed form average only where a Gaussian column belongs to one factor, "
+                    f"but column {column} belongs to {users}; put the factors on columns of their own"
+                )
+        return reduce(mul, (kernel.expected(x, z) for kernel in self.parts))

@@ -1,0 +1,58 @@
+"""Inputs of which some columns are Gaussian: states with the actions that a policy may take in them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torch_gprl.typing import Inputs
+
+
+@dataclass(frozen=True)
+class GaussianInputs:
+    """Points [*batch, N, D] whose `columns` are independent Gaussians and whose other columns are known.
+
+    Args:
+        mean: the points; in the Gaussian columns, their means.
+        variance: variances [*batch, N, A] of the A Gaussian columns, in squared units of the inputs; 0 is
+            allowed.
+        columns: which columns are Gaussian, in the order of `variance`.
+
+    Raises:
+        ValueError: columns that repeat or do not exist, or that `variance` does not match.
+    """
+
+    mean: Inputs
+    variance: Float[Tensor, "*#batch N A"]
+    columns: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        dims = self.mean.shape[-1]
+        if len(set(self.columns)) != len(self.columns) or not set(self.columns) <= set(range(dims)):
+            raise ValueError(f"columns must be distinct numbers from 0 to {dims - 1}, got {self.columns}")
+        if self.variance.shape[-1] != len(self.columns):
+            raise ValueError(
+                f"variance needs one column for each of {self.columns}, got shape "
+                f"{tuple(self.variance.shape)}"
+            )
+
+    @classmethod
+    def exactly(cls, points: Inputs) -> Self:
+        """Points [*batch, N, D] without a Gaussian column."""
+        return cls(points, points[..., :0], ())
+
+    def select(self, columns: Sequence[int]) -> Self:
+        """The given columns alone, numbered anew."""
+        kept = [i for i, column in enumerate(columns) if column in self.columns]
+        source = [self.columns.index(columns[i]) for i in kept]
+        return type(self)(self.mean[..., list(columns)], self.variance[..., source], tuple(kept))
+
+    def full_variance(self) -> Inputs:
+        """Variance of every column [*batch, N, D]: zero where the column is known."""
+        batch = torch.broadcast_shapes(self.mean.shape[:-1], self.variance.shape[:-1])
+        zero = self.variance.new_zeros(*batch, self.mean.shape[-1])
+        index = torch.tensor(self.columns, dtype=torch.long, device=zero.device)
+        return zero.index_copy(-1, index, self.variance.expand(*batch, len(self.columns)))

@@ -5,6 +5,7 @@ Nothing here knows what is learned: these take tensors, arrays and labels.
 
 from torch_gprl.runs.checkpoints import Checkpoints
 from torch_gprl.runs.errors import UserError
+from torch_gprl.runs.evaluation import evaluate, film
 from torch_gprl.runs.figures import Surface, learning_curve, save_figure, value_surface
 from torch_gprl.runs.folder import RunFolder
 from torch_gprl.runs.intervals import bootstrap_interval
@@ -20,6 +21,8 @@ __all__ = [
     "Surface",
     "UserError",
     "bootstrap_interval",
+    "evaluate",
+    "film",
     "learning_curve",
     "read_metrics",
     "save_figure",

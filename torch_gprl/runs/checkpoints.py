@@ -9,7 +9,7 @@ import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ from torch_gprl.runs.errors import UserError
 KEPT = 2  # the newest, and the one before in case the newest was cut off by a crash
 
 
+@runtime_checkable
 class Stateful(Protocol):
     """Anything with a state of tensors and plain numbers."""
 

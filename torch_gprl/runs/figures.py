@@ -42,8 +42,8 @@ def learning_curve(
     axes = figure.add_subplot()
     if learners > 1:
         label, low, high = _band(returns)
-        axes.fill_between(frames, low, high, color=COLOUR, alpha=0.2, linewidth=0, label=label)
-        axes.plot(frames, returns, color=COLOUR, alpha=min(0.5, 4 / learners), linewidth=0.6)
+        axes.plot(frames, returns, color="0.72", linewidth=0.5)
+        axes.fill_between(frames, low, high, color=COLOUR, alpha=0.35, linewidth=0, label=label, zorder=2)
     label = f"mean of {learners} learners" if learners > 1 else "return"
     axes.plot(frames, returns.mean(axis=1), color=COLOUR, linewidth=1.8, label=label)
     if threshold is not None:
@@ -101,9 +101,9 @@ def value_surface(surface: Surface, title: str = "") -> Figure:
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, (name, values, colours, unit) in zip((left, right), panels, strict=True):
         mesh = axes.pcolormesh(surface.x, surface.y, values, cmap=colours, shading="gouraud", rasterized=True)
-        figure.colorbar(mesh, ax=axes, label=unit)
+        figure.colorbar(mesh, ax=axes, label=unit, pad=0.02)
         axes.scatter(*surface.basis.T, s=11, facecolor="white", edgecolor="black", linewidth=0.6)
-        axes.set(title=f"{name}", xlabel=surface.labels[0])
+        axes.set(title=name, xlabel=surface.labels[0])
         axes.set(xlim=surface.x[[0, -1]], ylim=surface.y[[0, -1]])
         axes.title.set_size("medium")
     left.set_ylabel(surface.labels[1])

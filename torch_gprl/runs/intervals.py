@@ -31,4 +31,4 @@ def bootstrap_interval(
     means = values @ (counts.T / learners)  # [*batch, RESAMPLES]
     tail = (1 - LEVEL) / 2
     low, high = np.quantile(means, [tail, 1 - tail], axis=-1)
-    return low, high
+    return np.asarray(low), np.asarray(high)

@@ -1,8 +1,10 @@
 """The environment for TorchRL: copies of a task as an `EnvBase` of batch [learners, num_envs].
 
-Time limits set `truncated`, the task's rule sets `terminated`, and the two are never merged, so that values can
-be bootstrapped at time limits.
+Time limits set `truncated`, the task's rule sets `terminated`, and the two are never merged, so that values
+can be bootstrapped at time limits.
 """
+
+import math
 
 import mujoco
 import torch
@@ -16,13 +18,15 @@ from envs.copies import Copies, Options
 from envs.rendering import Picture
 from envs.task import Plane, Task
 
+FLAGS = ("terminated", "truncated", "done")
+
 
 class BatchEnv(EnvBase):
     """A task's copies as one TorchRL environment of batch `[learners, num_envs]`.
 
     Keys: `observation` [..., do]; `action` [..., da] in the actuators' units, clipped to their bounds; under
-    `next` also `reward`, `terminated`, `truncated`, `done` [..., 1], and with `Options.info` the reward's named
-    parts under `info`. A copy whose simulation diverges ends with `terminated` in the last state it had.
+    `next` also `reward`, `terminated`, `truncated`, `done` [..., 1], and with `Options.info` the reward's
+    named parts under `info`. A copy whose simulation diverges ends with `terminated` in the last state it had.
 
     Args:
         task: the task.
@@ -30,15 +34,17 @@ class BatchEnv(EnvBase):
 
     Attributes:
         task: the task.
-        plane: its picture plane, or None.
+        options: as given.
+        plane: the task's picture plane, or None.
     """
 
     # TorchRL wraps an environment that has an attribute `frame_skip`; ours repeats physics steps itself.
     _has_frame_skip = True
 
     def __init__(self, task: Task, options: Options) -> None:
-        shape = torch.Size([options.learners, options.num_envs])
-        super().__init__(device=torch.device(options.device), batch_size=shape)
+        self._shape = torch.Size([options.learners, options.num_envs])
+        self._to = (torch.device(options.device), options.dtype)
+        super().__init__(device=self._to[0], batch_size=self._shape)
         self.task, self.options = task, options
         self.plane: Plane | None = task.plane
         self._copies = Copies(task, options)
@@ -52,21 +58,23 @@ class BatchEnv(EnvBase):
 
     def _make_specs(self) -> None:
         """Read the observation's size and the reward's parts off a trial state."""
-        shape, dtype, device = self.batch_size, self.options.dtype, self.device
-        copies = self._copies
+        shape, copies = self._shape, self._copies
+        kind = {"device": self._to[0], "dtype": self._to[1]}
         size = self.task.observation(copies.state).shape[-1]
         parts = self.task.reward(copies.state, copies.low.expand(copies.size, -1), copies.state).parts
         one = torch.Size([*shape, 1])
-        observation = Unbounded(torch.Size([*shape, size]), dtype=dtype, device=device)
-        self.observation_spec = Composite(observation=observation, shape=shape)
         self._parts = tuple(parts) if self.options.info else ()
+        # Of outputs, by their number of dimensions in `Copies`.
+        self._shapes = {1: one, 2: torch.Size([*shape, size])}
+        self.observation_spec = Composite(observation=Unbounded(self._shapes[2], **kind), shape=shape)
         if self._parts:
-            info = {name: Unbounded(one, dtype=dtype, device=device) for name in parts}
+            info = {name: Unbounded(one, **kind) for name in parts}
             self.observation_spec["info"] = Composite(info, shape=shape)
-        low, high = (bound.to(device, dtype).expand(*shape, -1) for bound in (copies.low, copies.high))
-        self.action_spec = Bounded(low, high, shape=low.shape, dtype=dtype, device=device)
-        self.reward_spec = Unbounded(one, dtype=dtype, device=device)
-        flags = {name: Binary(1, shape=one, dtype=torch.bool, device=device) for name in FLAGS}
+        low, high = (bound.to(*self._to).expand(*shape, -1) for bound in (copies.low, copies.high))
+        self._action_shape = low.shape
+        self.action_spec = Bounded(low, high, shape=low.shape, **kind)
+        self.reward_spec = Unbounded(one, **kind)
+        flags = {name: Binary(1, shape=one, dtype=torch.bool, device=self._to[0]) for name in FLAGS}
         self.done_spec = Composite(flags, shape=shape)
 
     def _set_seed(self, seed: int | None) -> None:
@@ -76,26 +84,40 @@ class BatchEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = self._copies.all if mask is None else mask.reshape(-1).cpu().numpy().nonzero()[0]
         self._copies.reset(rows)
-        out = {"observation": self._out(self._copies.observation())}
+        device, dtype = self._to
+        out: dict[str, Tensor | TensorDict] = {"observation": self._out(self._copies.observation())}
         for name in FLAGS:
-            out[name] = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
+            out[name] = torch.zeros(self._shapes[1], dtype=torch.bool, device=device)
         if self._parts:
-            zero = torch.zeros(*self.batch_size, 1, dtype=self.options.dtype, device=self.device)
-            out["info"] = TensorDict({name: zero.clone() for name in self._parts}, self.batch_size)
-        return TensorDict(out, self.batch_size, device=self.device)
+            zeros = {name: torch.zeros(self._shapes[1], dtype=dtype, device=device) for name in self._parts}
+            out["info"] = TensorDict(zeros, self._shape)
+        return TensorDict(out, self._shape, device=device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         observation, reward, parts, terminated, truncated = self._copies.step(self._command(tensordict))
-        out = {
+        out: dict[str, Tensor | TensorDict] = {
             "observation": self._out(observation),
             "reward": self._out(reward),
-            "terminated": self._out(terminated),
-            "truncated": self._out(truncated),
-            "done": self._out(terminated | truncated),
+            "terminated": self._flag(terminated),
+            "truncated": self._flag(truncated),
+            "done": self._flag(terminated | truncated),
         }
         if self._parts:
-            out["info"] = TensorDict({name: self._out(parts[name]) for name in self._parts}, self.batch_size)
-        return TensorDict(out, self.batch_size, device=self.device)
+            out["info"] = TensorDict({name: self._out(parts[name]) for name in self._parts}, self._shape)
+        # The checks of the constructor would cost a tenth of a step of 64 small simulations.
+        return TensorDict._new_unsafe(out, self._shape, device=self._to[0])
+
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """A step, then a reset of what is done; as TorchRL's, without the cases that we do not have."""
+        keys = tensordict.keys()
+        if "next" in keys or "_step" in keys or tensordict.batch_size != self._shape:
+            return super().step_and_maybe_reset(tensordict)
+        tensordict.set("next", self._step(tensordict))
+        return tensordict, self.maybe_reset(self._step_mdp(tensordict))
+
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        """Nothing: TorchRL completes and reshapes entries here, and `_step` leaves none to mend."""
+        return next_tensordict_out
 
     def _command(self, tensordict: TensorDictBase) -> Tensor:
         """The action as [B, da] on the CPU.
@@ -104,25 +126,30 @@ class BatchEnv(EnvBase):
             ValueError: if its shape is wrong or an entry is not finite.
         """
         action = tensordict.get("action")
-        expected = self.action_spec.shape
-        if action.shape != expected:
+        if action.shape != self._action_shape:
             raise ValueError(
-                f"action must be [learners, num_envs, action size] = {list(expected)}, not {list(action.shape)}"
+                f"action must be [learners, num_envs, action size] = {list(self._action_shape)}, "
+                f"not {list(action.shape)}"
             )
-        action = action.reshape(-1, expected[-1]).cpu()
-        if not action.isfinite().all():
-            copy, entry = (~action.isfinite()).nonzero()[0].tolist()
-            learner, env = divmod(copy, expected[1])
+        flat = action.cpu().reshape(self._copies.size, -1)
+        if math.isfinite(flat.sum()):  # the quick proof that all entries are
+            return flat
+        bad = (~action.isfinite()).nonzero().tolist()
+        if bad:
+            learner, env, entry = bad[0]
             raise ValueError(
-                f"actions must be finite, but learner {learner}, environment {env} got "
-                f"action[{entry}] = {action[copy, entry].item()}; look for a diverged policy or an empty batch"
+                f"actions must be finite, but entry {entry} of learner {learner}, environment {env} is "
+                f"{action[tuple(bad[0])].item()}; look for a diverged policy"
             )
-        return action
+        return flat
 
     def _out(self, value: Tensor) -> Tensor:
-        """[B] or [B, n] as `[learners, num_envs, 1 or n]` in the output's dtype and on its device."""
-        dtype = torch.bool if value.dtype == torch.bool else self.options.dtype
-        return value.reshape(*self.batch_size, -1).to(self.device, dtype)
+        """Numbers [B] or [B, n] as `[learners, num_envs, 1 or n]` in the output's dtype, on its device."""
+        return value.to(*self._to).view(self._shapes[value.ndim])
+
+    def _flag(self, value: Tensor) -> Tensor:
+        """Flags [B] as `[learners, num_envs, 1]` on the output's device."""
+        return value.to(self._to[0]).view(self._shapes[1])
 
     def render(
         self, learner: int = 0, env: int = 0, width: int = 480, height: int = 480
@@ -131,8 +158,5 @@ class BatchEnv(EnvBase):
         if (width, height) not in self._pictures:
             model = mujoco.MjModel.from_xml_path(str(self.task.scene))
             self._pictures[width, height] = Picture(model, self.task.pose, width, height)
-        qpos = self._copies.state.qpos.reshape(*self.batch_size, -1)[learner, env].numpy()
+        qpos = self._copies.state.qpos.view(*self._shape, -1)[learner, env].numpy()
         return torch.from_numpy(self._pictures[width, height].frame(qpos))
-
-
-FLAGS = ("terminated", "truncated", "done")

@@ -16,8 +16,10 @@ from torch import Tensor
 
 from envs.noise import StepNoise
 from envs.philox import StartDraws, Streams
-from envs.task import Noise, State, Task
+from envs.physics import State
+from envs.task import Task
 
+NOISE_BLOCKS = {"action": 64, "velocity": 128, "observation": 192}  # addresses within a step
 COPIES_PER_THREAD = 64  # fewer copies than this are not worth waking another thread for
 
 
@@ -89,18 +91,23 @@ class Copies:
         self._horizon = task.horizon if options.horizon is None else options.horizon
         self._physics = task.physics(self.size, _threads(options.threads, self.size))
         self.state = State(self._physics.qpos, self._physics.qvel, self._physics.derived)
-        self._scale = _noise(task.noise, options)
         self.seed(options.seed)
 
     def seed(self, seed: int) -> None:
         """Start all random streams anew; takes effect at the next reset."""
         options = self.options
         self._streams = Streams(seed, options.learners, options.num_envs, options.first_learner)
-        self._noise = None
-        if any(vars(self._scale).values()):
-            widths = (self.low.numel(), self.state.qvel.shape[1], self.task.observation(self.state).shape[1])
-            self._noise = StepNoise(self._streams, sum(widths))
-            self._widths = widths
+        widths = {
+            "action": self.low.numel(),
+            "velocity": self.state.qvel.shape[1],
+            "observation": self.task.observation(self.state).shape[1],
+        }
+        self._noise: dict[str, StepNoise] = {}
+        for name, block in NOISE_BLOCKS.items():
+            chosen = getattr(options, f"{name}_noise")
+            std = getattr(self.task.noise, name) if chosen is None else chosen
+            if std > 0:
+                self._noise[name] = StepNoise(self._streams, std, widths[name], block)
 
     def reset(self, rows: NDArray[np.intp]) -> None:
         """Start new episodes in the copies `rows` [R]."""
@@ -108,14 +115,14 @@ class Copies:
         self.steps[rows] = 0
         qpos, qvel = self.task.start(StartDraws(self._streams, rows))
         self._physics.place(rows, qpos, qvel)
-        if self._noise is not None:
-            self._noise.refill(rows, self.steps[rows])
+        for noise in self._noise.values():
+            noise.start(rows)
 
     def observation(self) -> Float[Tensor, "B do"]:
         """What the agent sees of the present state."""
         observation = self.task.observation(self.state)
-        if self._scale.observation:
-            observation += self._scale.observation * self._draw()[2]
+        if "observation" in self._noise:
+            observation += self._noise["observation"].now
         return observation
 
     def step(self, action: Float[Tensor, "B da"]) -> Step:
@@ -125,33 +132,24 @@ class Copies:
             action: [B, da] finite commands in the actuators' units; noise is added, then they are clipped.
         """
         self.steps += 1
-        if self._scale.action:
-            action = action + self._scale.action * self._draw()[0]
-        action = torch.clamp(action.double(), self.low, self.high)
+        for noise in self._noise.values():
+            noise.advance(self.steps)
+        if "action" in self._noise:
+            action = action + self._noise["action"].now
+        action = torch.clamp(action, self.low, self.high)
         before = self._physics.advance(action)
-        if self._scale.velocity:
-            self.state.qvel.add_(self._draw()[1], alpha=self._scale.velocity)
+        if "velocity" in self._noise:
+            self.state.qvel.add_(self._noise["velocity"].now)
         diverged = self._physics.diverged()
         if diverged is not None:
+            self.divergences += int(diverged.sum())
             self._physics.restore(diverged)
         reward, parts = self.task.reward(before, action, self.state)
         terminated = self.task.terminated(self.state)
         if diverged is not None:
-            self.divergences += int(diverged.sum())
             terminated = terminated | diverged
         truncated = torch.from_numpy(self.steps >= self._horizon)
         return Step(self.observation(), reward, parts, terminated, truncated)
-
-    def _draw(self) -> tuple[Tensor, ...]:
-        """Standard normal numbers of the present step: for actions, velocities and observations."""
-        assert self._noise is not None
-        return self._noise.at(self.steps).split(self._widths, dim=1)
-
-
-def _noise(default: Noise, options: Options) -> Noise:
-    chosen = (options.observation_noise, options.action_noise, options.velocity_noise)
-    defaults = (default.observation, default.action, default.velocity)
-    return Noise(*(std if value is None else value for value, std in zip(chosen, defaults, strict=True)))
 
 
 def _threads(threads: int | None, copies: int) -> int:

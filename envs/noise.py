@@ -1,45 +1,54 @@
 """Normal noise for every control step, computed ahead.
 
-Counter-based numbers cost many small array operations whether one step or thirty are asked for, so each
-environment keeps the noise of its next `AHEAD` steps.
+Counter-based numbers cost many small array operations whether one step or thirty are asked for, so the noise
+of the next `AHEAD` steps of all environments is kept, and a step only moves on to the next slice of it.
 """
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from envs.philox import NOISE_BLOCK, Streams
+from envs.philox import Streams
 
 AHEAD = 32  # steps
 
 
 class StepNoise:
-    """Standard normal vectors of `size` entries, one per environment and step.
+    """Normal vectors for environments that all step together but began their episodes at different times.
 
     Args:
         streams: where the numbers come from.
-        size: entries of each vector.
+        std: standard deviation of every entry.
+        size: entries of an environment's vector.
+        block: the block of each step's address at which the numbers begin.
+
+    Attributes:
+        now: [B, size] the noise of the present step, float64.
     """
 
-    def __init__(self, streams: Streams, size: int) -> None:
-        self._streams, self._size = streams, size
-        copies = len(streams.episode)
-        self._all = np.arange(copies)
-        self._first = np.zeros(copies, dtype=np.int64)  # the step of each environment's first stored vector
-        self._ahead = np.zeros((copies, AHEAD, size))
+    def __init__(self, streams: Streams, std: float, size: int, block: int) -> None:
+        self._streams, self._std, self._block = streams, std, block
+        self._all = np.arange(len(streams.episode))
+        self._ahead = torch.zeros(AHEAD, len(self._all), size, dtype=torch.float64)
+        self._slices: list[Tensor] = list(self._ahead.unbind())
+        self._slot = AHEAD - 1
+        self.now = self._slices[self._slot]
 
-    def refill(self, rows: NDArray[np.intp], steps: NDArray[np.int64]) -> None:
-        """Compute the vectors of the next steps of `rows` [R], from `steps` [R] on."""
-        step = (steps[:, None] + np.arange(AHEAD)).astype(np.uint64)
-        self._ahead[rows] = self._streams.normal(rows, step, self._size, NOISE_BLOCK)
-        self._first[rows] = steps
+    def start(self, rows: NDArray[np.intp]) -> None:
+        """Environments `rows` [R] begin a new episode: they are at step 0 of it now."""
+        self._fill(rows, np.zeros(len(rows), dtype=np.int64))
 
-    def at(self, steps: NDArray[np.int64]) -> Float[Tensor, "B size"]:
-        """The vectors of all environments, each at its own step `steps` [B]."""
-        offset = steps - self._first
-        if offset.max() >= AHEAD:
-            self.refill(self._all, steps)
-            offset = np.zeros_like(steps)
-        return torch.from_numpy(self._ahead[self._all, offset])
+    def advance(self, steps: NDArray[np.int64]) -> None:
+        """All environments have moved to the next step; `steps` [B] is where each is in its episode."""
+        self._slot += 1
+        if self._slot == AHEAD:
+            self._slot = 0
+            self._fill(self._all, steps)
+        self.now = self._slices[self._slot]
+
+    def _fill(self, rows: NDArray[np.intp], steps: NDArray[np.int64]) -> None:
+        """Compute the vectors of `rows` from the present slot to the last."""
+        step = (steps[:, None] + np.arange(AHEAD - self._slot)).astype(np.uint64)
+        unit = self._streams.normal(rows, step, self._ahead.shape[-1], self._block)
+        self._ahead[self._slot :, torch.from_numpy(rows)] = torch.from_numpy(self._std * unit).transpose(0, 1)

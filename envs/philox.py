@@ -21,8 +21,7 @@ LOW_WORD = np.uint64(0xFFFFFFFF)
 WORD_BITS = np.uint64(32)
 
 BLOCK_BITS = 8  # a step owns 2⁸ blocks of four words; 24 bits remain for the step
-START_BLOCK = 0  # draws of an episode's start
-NOISE_BLOCK = 128  # draws of the noise
+START_BLOCK = 0  # where the draws of an episode's start begin
 
 
 def philox(key: int, counter: Sequence[NDArray[np.uint64]]) -> list[NDArray[np.uint64]]:

@@ -5,6 +5,7 @@ once a control step and wraps the results for TorchRL.
 """
 
 import abc
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,7 +31,7 @@ class Reward(NamedTuple):
     @classmethod
     def of(cls, **parts: Tensor) -> "Reward":
         """The sum of the parts, in the order given."""
-        return cls(sum(parts.values(), start=torch.zeros(())), parts)
+        return cls(functools.reduce(torch.add, parts.values()), parts)
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def test_a_surface_shows_value_and_uncertainty_over_the_plane():
     for axes, values in zip(figure.axes, (surface.mean, surface.stddev), strict=False):
         mesh, points = axes.collections
         assert np.asarray(mesh.get_array()) == pytest.approx(values)
-        assert mesh.get_coordinates()[1, 2] == pytest.approx([surface.x[2], surface.y[1]])
+        assert mesh.get_coordinates()[1, 2].tolist() == pytest.approx([surface.x[2], surface.y[1]])
         assert np.asarray(points.get_offsets()) == pytest.approx(surface.basis)
         assert axes.get_xlabel() == "a"
         assert axes.get_xlim() == (-3, 3)

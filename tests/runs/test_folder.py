@@ -76,3 +76,15 @@ def test_a_file_in_the_way_is_named(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=r"cannot write run folder .*file"):
         RunFolder(tmp_path / "file" / "run")
+
+
+def test_the_evaluation_lists_every_episode(tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    folder.write_evaluation(torch.tensor([[1.5, 2.0], [0.1, 4.0]], dtype=torch.float64))
+    assert (folder.path / "evaluation.csv").read_text(encoding="utf-8").split() == [
+        "learner,episode,return",
+        "0,0,1.5",
+        "0,1,2.0",
+        "1,0,0.1",
+        "1,1,4.0",
+    ]

@@ -3,6 +3,7 @@
     runs/<task>-<algorithm>-<date>-<time>/
       config.yaml        every option as resolved, versions, git commit, command line
       metrics.csv        one row per update and learner
+      evaluation.csv     one row per learner and episode of the final evaluation
       tensorboard/       the same numbers as TensorBoard events
       checkpoints/       the last two states
       figures/  videos/
@@ -10,6 +11,7 @@
 A run can be understood, drawn again and repeated from its folder alone.
 """
 
+import csv
 import dataclasses
 import importlib.metadata
 import platform
@@ -21,6 +23,8 @@ from datetime import datetime
 from pathlib import Path
 
 import yaml
+from jaxtyping import Float
+from torch import Tensor
 
 import torch_gprl
 from torch_gprl.runs.errors import UserError
@@ -99,6 +103,14 @@ class RunFolder:
         }
         text = yaml.safe_dump(record, sort_keys=False, allow_unicode=True)
         (self.path / "config.yaml").write_text(text, encoding="utf-8")
+
+    def write_evaluation(self, returns: Float[Tensor, "learners episodes"]) -> None:
+        """Write `evaluation.csv`: the return of every episode of the final evaluation."""
+        with (self.path / "evaluation.csv").open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file)
+            table.writerow(["learner", "episode", "return"])
+            for learner, episodes in enumerate(returns.tolist()):
+                table.writerows((learner, episode, value) for episode, value in enumerate(episodes))
 
 
 def _plain(value: object) -> object:

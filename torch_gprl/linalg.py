@@ -34,7 +34,7 @@ def cholesky(matrix: SquareMatrix, max_jitter: float | None = None) -> SquareMat
         CholeskyError: an entry holds NaN or infinity, or is not positive definite with the largest jitter.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
-    if not info.any():
+    if _succeeded(factor, info):
         return factor
     _refuse_non_finite(matrix)
     eps = torch.finfo(matrix.dtype).eps
@@ -46,10 +46,16 @@ def cholesky(matrix: SquareMatrix, max_jitter: float | None = None) -> SquareMat
         added = torch.where(info > 0, jitter * scale, added)
         diagonal = added.unsqueeze(-1).expand(matrix.shape[:-1])
         factor, info = torch.linalg.cholesky_ex(matrix + torch.diag_embed(diagonal))
-        if not info.any():
+        if _succeeded(factor, info):
             return factor
         jitter *= JITTER_GROWTH
     raise CholeskyError(_not_positive_definite(matrix, info, limit))
+
+
+def _succeeded(factor: Tensor, info: Tensor) -> bool:
+    # `info` may let NaN and infinity pass; they end in the pivots
+    pivots = factor.detach().diagonal(dim1=-2, dim2=-1)
+    return bool(pivots.sum().isfinite() & ~info.any())
 
 
 def _refuse_non_finite(matrix: Tensor) -> None:
@@ -57,17 +63,17 @@ def _refuse_non_finite(matrix: Tensor) -> None:
     if bad.any():
         raise CholeskyError(
             f"cholesky needs finite numbers, got {int(bad.sum())} NaN or infinite ones in a matrix of shape "
-            f"{tuple(matrix.shape)}, {matrix.dtype}; look for NaN in the inputs, or for a length scale, output "
-            "scale or noise variance that ran off to 0 or infinity"
+            f"{tuple(matrix.shape)}, {matrix.dtype}; look for NaN in the inputs, or for a length scale, "
+            "output scale or noise variance that ran off to 0 or infinity"
         )
 
 
 def _not_positive_definite(matrix: Tensor, info: Tensor, limit: float) -> str:
     first = matrix.reshape(-1, *matrix.shape[-2:])[int(info.reshape(-1).nonzero()[0])].detach()
     return (
-        f"cholesky needs positive definite matrices, got {int((info > 0).sum())} that are not; the first has "
-        f"size {matrix.shape[-1]}, {matrix.dtype}, mean diagonal {float(first.diagonal().mean()):.3g} and "
-        f"smallest eigenvalue {float(torch.linalg.eigvalsh(first)[0]):.3g}; jitter tried up to {limit:.1g} of "
-        "the mean diagonal; use float64, raise the noise variance or the novelty threshold, drop "
-        "near-duplicate points, or check that the kernel is positive semi-definite"
+        f"cholesky needs positive definite matrices, got {int((info > 0).sum())} that are not; the first "
+        f"has size {matrix.shape[-1]}, {matrix.dtype}, mean diagonal {float(first.diagonal().mean()):.3g}, "
+        f"smallest eigenvalue {float(torch.linalg.eigvalsh(first)[0]):.3g}; jitter tried up to "
+        f"{limit:.1g} of the mean diagonal; use float64, raise the noise variance or the novelty threshold, "
+        "drop near-duplicate points, or check that the kernel is positive semi-definite"
     )

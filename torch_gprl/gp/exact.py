@@ -12,7 +12,6 @@ differentiable in them.
 """
 
 import math
-from typing import Self
 
 import torch
 from jaxtyping import Float
@@ -50,7 +49,7 @@ class ExactGP(nn.Module):
         self.register_buffer("inputs", like.new_zeros(0, kernel.input_dim), persistent=False)
         self.register_buffer("targets", like.new_zeros(0), persistent=False)
 
-    def fit(self, inputs: Inputs, targets: Targets) -> Self:
+    def fit(self, inputs: Inputs, targets: Targets) -> "ExactGP":
         """Take data [*batch, N, D] and [*batch, N] in place of any before; parameters stay as they are."""
         self.inputs, self.targets = inputs.to(self.log_noise_variance), targets.to(self.log_noise_variance)
         return self

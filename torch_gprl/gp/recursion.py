@@ -37,8 +37,8 @@ class RecursiveGP:
         novelty_threshold: novelty above which a point joins the basis, in noise variances.
         projection: "moment" keeps the exact marginal posterior of the basis values where a point is projected
             or a vector deleted; "dtc" predicts the value that goes from the basis, as if without residual.
-        score: loss by a vector's deletion; "mean" is (α_i/K⁻¹_ii)², the squared change of the mean there, "kl"
-            is α_i²/(K⁻¹_ii + C_ii).
+        score: loss by a vector's deletion; "mean" is (α_i/K⁻¹_ii)², the squared change of the mean there,
+            "kl" is α_i²/(K⁻¹_ii + C_ii).
     """
 
     def __init__(

@@ -68,7 +68,7 @@ class Kernel(nn.Module, ABC):
     def _expected(self, x: GaussianInputs, z: GaussianInputs) -> Tensor:
         raise NotImplementedError(
             f"{type(self).__name__} has no closed form average over Gaussian columns; use "
-            "SquaredExponential or Linear on these columns, in a product by Columns with any kernel on the others"
+            "SquaredExponential or Linear on these columns, times any kernel on the others by Columns"
         )
 
     def set_prior(self, name: str, prior: Distribution) -> None:
@@ -149,7 +149,8 @@ class _Composite(Kernel):
         if len(dims) != 1:
             raise ValueError(
                 f"{type(self).__name__} needs kernels of one input_dim, got "
-                f"{[kernel.input_dim for kernel in kernels]}; Columns(kernel, columns, input_dim) puts a kernel on some columns of wider inputs"
+                f"{[kernel.input_dim for kernel in kernels]}; Columns(kernel, columns, input_dim) puts one "
+                "on some columns of wider inputs"
             )
         super().__init__(dims.pop(), torch.broadcast_shapes(*(kernel.batch_shape for kernel in kernels)))
         self.kernels = nn.ModuleList(kernels)
@@ -197,7 +198,7 @@ class Product(_Composite):
             users = [type(kernel).__name__ for kernel in self.parts if column in kernel.active_columns]
             if len(users) > 1:
                 raise NotImplementedError(
-                    f"a product has a closed form average only where a Gaussian column belongs to one factor, "
-                    f"but column {column} belongs to {users}; put the factors on columns of their own"
+                    f"a product has a closed form average only where a Gaussian column belongs to one "
+                    f"factor, but column {column} belongs to {users}; put the factors on columns of their own"
                 )
         return reduce(mul, (kernel.expected(x, z) for kernel in self.parts))

@@ -30,13 +30,15 @@ def log_gaussian(
         log_lengthscale: log ℓ [*batch, D].
         log_outputscale: log σ² [*batch]; 0 unless told.
     """
+    same = x is z
+    x, z = x.to(log_lengthscale.dtype), z.to(log_lengthscale.dtype)
     tensors = (x, z, log_lengthscale) if log_outputscale is None else (x, z, log_lengthscale, log_outputscale)
     needs_grad = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
     offset = None if log_outputscale is None else log_outputscale[..., None, None]
     if not needs_grad and x.shape[-2] * z.shape[-2] * x.shape[-1] <= DIRECT_SIZE:
         return _by_differences(x, z, log_lengthscale, offset)
     exponent = _by_matrix_product(x, z, log_lengthscale, offset)
-    if x is z:
+    if same:
         diagonal = exponent.diagonal(dim1=-2, dim2=-1)
         diagonal.copy_(torch.zeros_like(diagonal) if offset is None else offset.squeeze(-1))
     return exponent

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import torch
 from jaxtyping import Float
@@ -40,15 +39,15 @@ class GaussianInputs:
             )
 
     @classmethod
-    def exactly(cls, points: Inputs) -> Self:
+    def exactly(cls, points: Inputs) -> "GaussianInputs":
         """Points [*batch, N, D] without a Gaussian column."""
         return cls(points, points[..., :0], ())
 
-    def select(self, columns: Sequence[int]) -> Self:
+    def select(self, columns: Sequence[int]) -> "GaussianInputs":
         """The given columns alone, numbered anew."""
         kept = [i for i, column in enumerate(columns) if column in self.columns]
         source = [self.columns.index(columns[i]) for i in kept]
-        return type(self)(self.mean[..., list(columns)], self.variance[..., source], tuple(kept))
+        return GaussianInputs(self.mean[..., list(columns)], self.variance[..., source], tuple(kept))
 
     def full_variance(self) -> Inputs:
         """Variance of every column [*batch, N, D]: zero where the column is known."""

@@ -41,7 +41,8 @@ class Linear(Kernel):
 
     def forward(self, x: Inputs, z: OtherInputs) -> CrossMatrix:
         """Covariance of x [*batch, N, D] with z [*batch, M, D]: [*batch, N, M]."""
-        return (x * self.slope_variance.unsqueeze(-2)) @ z.mT.to(x) + self.bias_variance[..., None, None]
+        slope_variance = self.slope_variance.unsqueeze(-2)
+        return x.to(slope_variance.dtype) @ (z * slope_variance).mT + self.bias_variance[..., None, None]
 
     def diag(self, x: Inputs) -> PerPoint:
         """Prior variance at x [*batch, N, D]: [*batch, N]."""

@@ -200,7 +200,7 @@ class Periodic(Stationary):
 def _square_distance(x: Tensor, z: Tensor, weight: Tensor) -> Tensor:
     """Σ_d w_nd (x_nd − z_md)² [*batch, N, M] with weights [*batch, N, D] of each row of x, as one product."""
     centre = z[..., :1, :].detach()
-    x, z = x - centre, z - centre
+    x, z = (x - centre).to(weight.dtype), (z - centre).to(weight.dtype)
     weighted = weight * x
-    cross = torch.cat((weight, weighted), -1) @ torch.cat((z.square(), -2 * z), -1).mT
+    cross = torch.cat((weight.expand_as(weighted), weighted), -1) @ torch.cat((z.square(), -2 * z), -1).mT
     return cross + (weighted * x).sum(-1, keepdim=True)

@@ -4,11 +4,14 @@ Time limits set `truncated`, the task's rule sets `terminated`, and the two are 
 can be bootstrapped at time limits.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco takes its names from compiled modules, which pyright cannot read)
+
 import math
 
 import mujoco
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
@@ -26,7 +29,7 @@ class BatchEnv(EnvBase):
 
     Keys: `observation` [..., do]; `action` [..., da] in the actuators' units, clipped to their bounds; under
     `next` also `reward`, `terminated`, `truncated`, `done` [..., 1], and with `Options.info` the reward's
-    named parts under `info`. A copy whose simulation diverges ends with `terminated` in the last state it had.
+    named parts under `info`. A copy whose simulation diverges ends with `terminated` in the last good state.
 
     Args:
         task: the task.
@@ -56,6 +59,31 @@ class BatchEnv(EnvBase):
         """How many simulations have diverged since the environment was built."""
         return self._copies.divergences
 
+    @property
+    def qpos(self) -> Float[Tensor, "learners num_envs nq"]:
+        """The generalised positions, m or rad: a copy, float64, on the CPU."""
+        return self._copies.state.qpos.clone().view(*self._shape, -1)
+
+    @property
+    def qvel(self) -> Float[Tensor, "learners num_envs nv"]:
+        """The generalised velocities, m/s or rad/s: a copy, float64, on the CPU."""
+        return self._copies.state.qvel.clone().view(*self._shape, -1)
+
+    def place(
+        self, qpos: Float[Tensor, "learners num_envs nq"], qvel: Float[Tensor, "learners num_envs nv"]
+    ) -> TensorDict:
+        """Start new episodes in the given states; returns what `reset` would."""
+        self._copies.place(qpos.flatten(0, 1), qvel.flatten(0, 1))
+        return self._started()
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """The simulations, for `state_dict`: a run that loads it goes on bit for bit."""
+        return self._copies.save()
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Take up what `get_extra_state` gave, for `load_state_dict`."""
+        self._copies.load(state)
+
     def _make_specs(self) -> None:
         """Read the observation's size and the reward's parts off a trial state."""
         shape, copies = self._shape, self._copies
@@ -84,6 +112,10 @@ class BatchEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = self._copies.all if mask is None else mask.reshape(-1).cpu().numpy().nonzero()[0]
         self._copies.reset(rows)
+        return self._started()
+
+    def _started(self) -> TensorDict:
+        """What an agent sees of the present state when nothing is done."""
         device, dtype = self._to
         out: dict[str, Tensor | TensorDict] = {"observation": self._out(self._copies.observation())}
         for name in FLAGS:
@@ -158,5 +190,4 @@ class BatchEnv(EnvBase):
         if (width, height) not in self._pictures:
             model = mujoco.MjModel.from_xml_path(str(self.task.scene))
             self._pictures[width, height] = Picture(model, self.task.pose, width, height)
-        qpos = self._copies.state.qpos.view(*self._shape, -1)[learner, env].numpy()
-        return torch.from_numpy(self._pictures[width, height].frame(qpos))
+        return torch.from_numpy(self._pictures[width, height].frame(self.qpos[learner, env].numpy()))

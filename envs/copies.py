@@ -113,10 +113,37 @@ class Copies:
         """Start new episodes in the copies `rows` [R]."""
         self._streams.episode[rows] += np.uint64(1)
         self.steps[rows] = 0
-        qpos, qvel = self.task.start(StartDraws(self._streams, rows))
-        self._physics.place(rows, qpos, qvel)
+        self._physics.place(rows, *self.task.start(StartDraws(self._streams, rows)))
         for noise in self._noise.values():
             noise.start(rows)
+
+    def place(self, qpos: Float[Tensor, "B nq"], qvel: Float[Tensor, "B nv"]) -> None:
+        """Start new episodes of all copies in the given states."""
+        self.reset(self.all)
+        self._physics.place(self.all, qpos, qvel)
+
+    def save(self) -> dict[str, Tensor]:
+        """All that the future depends on, as copies."""
+        episode = torch.from_numpy(self._streams.episode.astype(np.int64))
+        steps = torch.from_numpy(self.steps.copy())
+        return {"physics": self._physics.rows.clone(), "steps": steps, "episode": episode}
+
+    def load(self, saved: dict[str, Tensor]) -> None:
+        """Go on from what `save` gave, bit for bit.
+
+        Raises:
+            ValueError: if it was saved from other numbers of copies or from another system.
+        """
+        if saved["physics"].shape != self._physics.rows.shape:
+            raise ValueError(
+                f"the saved environment has {list(saved['physics'].shape)} numbers (copies, state), this one "
+                f"{list(self._physics.rows.shape)}; make it with the same task, learners and num_envs"
+            )
+        self._physics.rows.copy_(saved["physics"])
+        self.steps[:] = saved["steps"].numpy()
+        self._streams.episode[:] = saved["episode"].numpy().astype(np.uint64)
+        for noise in self._noise.values():
+            noise.resume(self.steps)
 
     def observation(self) -> Float[Tensor, "B do"]:
         """What the agent sees of the present state."""

@@ -1,8 +1,11 @@
 """A plain drawing of a scene, for machines without OpenGL.
 
-Every shape that MuJoCo draws here is convex, so its picture is the convex hull of its projected surface points:
-project, fill the hull, farthest shape first. No shadows and no textures, but the motion is all there.
+Every shape that MuJoCo draws here is convex, so its picture is the convex hull of its projected surface
+points: project, fill the hull, farthest shape first. No shadows and no textures, but the motion is all there.
 """
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco takes its names from compiled modules, which pyright cannot read)
 
 import mujoco
 import numpy as np
@@ -86,7 +89,7 @@ class Sketch:
                 self._draw_ground(canvas, geom)
             else:
                 self._draw_shape(canvas, geom)
-        return np.asarray(image.resize(self._size, Image.Resampling.LANCZOS))
+        return np.array(image.resize(self._size, Image.Resampling.LANCZOS))
 
     def _look(self, camera: mujoco.MjvGLCamera) -> None:
         forward, up = np.array(camera.forward, dtype=float), np.array(camera.up, dtype=float)
@@ -120,7 +123,7 @@ class Sketch:
         if pixels is None:
             return
         outline = hull(pixels)
-        colour = np.array(geom.rgba[:3])
+        colour = np.array(geom.rgba[:3], dtype=float)
         canvas.polygon(_flat(outline), fill=_rgb(colour), outline=_rgb(0.6 * colour), width=OVERSAMPLING)
         if geom.type != mujoco.mjtGeom.mjGEOM_BOX:  # a gleam makes round things round
             centre = outline.mean(axis=0)

@@ -43,9 +43,14 @@ class StepNoise:
         """All environments have moved to the next step; `steps` [B] is where each is in its episode."""
         self._slot += 1
         if self._slot == AHEAD:
-            self._slot = 0
-            self._fill(self._all, steps)
+            self.resume(steps)
         self.now = self._slices[self._slot]
+
+    def resume(self, steps: NDArray[np.int64]) -> None:
+        """All environments are at `steps` [B] of their episodes, wherever they were before."""
+        self._slot = 0
+        self._fill(self._all, steps)
+        self.now = self._slices[0]
 
     def _fill(self, rows: NDArray[np.intp], steps: NDArray[np.int64]) -> None:
         """Compute the vectors of `rows` from the present slot to the last."""

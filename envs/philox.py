@@ -51,7 +51,8 @@ def philox(key: int, counter: Sequence[NDArray[np.uint64]]) -> list[NDArray[np.u
 
 def _unit(high: NDArray[np.uint64], low: NDArray[np.uint64]) -> NDArray[np.float64]:
     """Two words as a number of 53 bits in [0, 1)."""
-    return ((high >> np.uint64(5)) * 67108864.0 + (low >> np.uint64(6))) / 9007199254740992.0
+    bits = (high >> np.uint64(5) << np.uint64(26)) | (low >> np.uint64(6))
+    return bits.astype(np.float64) * 2.0**-53
 
 
 class Streams:

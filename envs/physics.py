@@ -4,6 +4,9 @@ MuJoCo's `Batch` steps all copies over one `(B, nstate)` float64 array, bit for 
 simulations would, on any number of threads; torch views the same memory.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco takes its names from compiled modules, which pyright cannot read)
+
 import abc
 from collections.abc import Mapping
 from pathlib import Path
@@ -43,11 +46,13 @@ class Physics(abc.ABC):
     """B copies of a system.
 
     Attributes:
-        qpos: [B, nq] float64, a live view of the simulator's memory: read it between steps, copy it to keep it.
+        qpos: [B, nq] float64, a live view of the simulator's memory; copy it to keep it.
         qvel: [B, nv] float64, likewise.
         derived: further live views, name -> [B, ...].
+        rows: [B, n] float64, a live view of all that the future depends on.
     """
 
+    rows: Tensor
     qpos: Tensor
     qvel: Tensor
     derived: dict[str, Tensor]
@@ -91,22 +96,22 @@ class MujocoPhysics(Physics):
         self.model = model
         self.batch = mujoco.batch.Batch(model, copies, nthread=threads)
         self._substeps = substeps
-        self._rows = torch.from_numpy(self.batch.state)
-        self._before = self._rows.clone()
-        qpos, qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
-        self.qpos, self.qvel = torch.from_numpy(qpos), torch.from_numpy(qvel)
-        self._past = State(
-            *(
-                self._before.as_strided(x.shape, x.stride(), x.storage_offset())
-                for x in (self.qpos, self.qvel)
-            )
-        )
-        self._control = torch.from_numpy(self.batch.bind("ctrl"))
+        self.rows = torch.from_numpy(self.batch.state)
+        self._before = self.rows.clone()
+        qpos, qvel, control = (self._columns(name) for name in ("qpos", "qvel", "ctrl"))
+        self.qpos, self.qvel, self._control = self.rows[:, qpos], self.rows[:, qvel], self.rows[:, control]
+        self._past = State(self._before[:, qpos], self._before[:, qvel])
         self.derived = {name: torch.from_numpy(self.batch.bind(name)) for name in derived}
+
+    def _columns(self, field: str) -> slice:
+        """Where a field of MjData lies in the state rows."""
+        view = self.batch.bind(field)
+        first = (view.ctypes.data - self.batch.state.ctypes.data) // view.itemsize
+        return slice(first, first + view.shape[1])
 
     def advance(self, control: Float[Tensor, "B nu"]) -> State:
         """Advance every copy by `substeps` physics steps; see `Physics.advance`."""
-        self._before.copy_(self._rows)
+        self._before.copy_(self.rows)
         self._control.copy_(control)
         self.batch.step(nstep=self._substeps)
         return self._past
@@ -131,7 +136,7 @@ class MujocoPhysics(Physics):
 
     def restore(self, rows: Bool[Tensor, " B"]) -> None:
         """Put back the state before the last step; see `Physics.restore`."""
-        self._rows[rows] = self._before[rows]
+        self.rows[rows] = self._before[rows]
 
 
 def stripped(path: Path) -> mujoco.MjModel:

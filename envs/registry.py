@@ -1,7 +1,6 @@
 """The list of tasks, and `make`, which turns one into an environment."""
 
 import difflib
-from typing import Any
 
 from envs import pendulum
 from envs.batch import BatchEnv
@@ -24,7 +23,7 @@ def find(task_id: str) -> Task:
     raise ValueError(f"unknown task {task_id!r}{hint} Choose one of {', '.join(ALL)}")
 
 
-def make(task_id: str, **options: Any) -> BatchEnv:
+def make(task_id: str, **options: object) -> BatchEnv:
     """A TorchRL environment of batch `[learners, num_envs]`.
 
     Args:
@@ -35,4 +34,4 @@ def make(task_id: str, **options: Any) -> BatchEnv:
     Raises:
         ValueError: if the task is unknown or an option is out of its range.
     """
-    return BatchEnv(find(task_id), Options(**options))
+    return BatchEnv(find(task_id), Options(**options))  # pyright: ignore[reportArgumentType]

@@ -5,12 +5,14 @@ state into it and draws. OpenGL without a screen comes from EGL or OSMesa; `MUJO
 disable) overrides the choice.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco takes its names from compiled modules, which pyright cannot read)
+
 import ctypes
 import importlib
 import os
 import warnings
 from collections.abc import Callable
-from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -27,14 +29,6 @@ NO_OPENGL = (
     "for the full picture on Debian or Ubuntu: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri, "
     "then run with MUJOCO_GL=egl"
 )
-
-
-class Drawing(Protocol):
-    """Something that turns a scene into pixels."""
-
-    def frame(self, scene: mujoco.MjvScene) -> NDArray[np.uint8]:
-        """[height, width, 3] pixels."""
-        ...
 
 
 class OpenGL:
@@ -124,7 +118,7 @@ class Picture:
         return self._drawing.frame(self._scene)
 
 
-def drawing(model: mujoco.MjModel, width: int, height: int) -> Drawing:
+def drawing(model: mujoco.MjModel, width: int, height: int) -> OpenGL | Sketch:
     """OpenGL if it works here, else a sketch and, once a process, a warning that says how to get OpenGL."""
     try:
         return OpenGL(model, width, height)

@@ -1,8 +1,11 @@
 """What a task is: pure batched functions of the state, and the numbers that fix the problem.
 
-A task holds no state and steps no simulator: `physics.py` moves the state, `batch.py` calls the functions here
-once a control step and wraps the results for TorchRL.
+A task holds no state and steps no simulator: `physics.py` moves the state, `copies.py` calls the functions
+here once a control step, `batch.py` wraps the results for TorchRL.
 """
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco takes its names from compiled modules, which pyright cannot read)
 
 import abc
 import functools
@@ -95,5 +98,5 @@ class Task(abc.ABC):
         data.qpos[:] = qpos
 
     def terminated(self, state: State) -> Bool[Tensor, " B"]:
-        """Where the episode is over for good; never, unless a task says otherwise. Time limits are not its business."""
+        """Where the episode is over for good, time limits aside; never, unless a task says otherwise."""
         return torch.zeros(len(state.qpos), dtype=torch.bool)

@@ -1,0 +1,33 @@
+"""The simulators: what they remember, and that stripping a model changes nothing."""
+
+import mujoco
+import numpy as np
+import torch
+
+from envs import pendulum
+from envs.physics import MujocoPhysics, stripped
+
+
+def test_a_step_returns_the_state_before_it():
+    physics = MujocoPhysics(stripped(pendulum.MODEL), copies=3, substeps=2, threads=1)
+    physics.place(np.arange(3), torch.rand(3, 1).double(), torch.rand(3, 1).double())
+    qpos, qvel = physics.qpos.clone(), physics.qvel.clone()
+    before = physics.advance(torch.ones(3, 1).double())
+    assert torch.equal(before.qpos, qpos)
+    assert torch.equal(before.qvel, qvel)
+    assert not torch.equal(physics.qvel, qvel)
+
+
+def test_the_stripped_model_moves_as_the_whole_one_bit_for_bit():
+    whole = mujoco.MjModel.from_xml_path(str(pendulum.MODEL))
+    batch = MujocoPhysics(stripped(pendulum.MODEL), copies=1, substeps=1, threads=1)
+    data = mujoco.MjData(whole)
+    batch.place(np.arange(1), torch.ones(1, 1).double(), torch.zeros(1, 1).double())
+    data.qpos[:] = 1
+    for step in range(500):
+        control = np.sin(step)
+        batch.advance(torch.full((1, 1), control).double())
+        data.ctrl[:] = control
+        mujoco.mj_step(whole, data)
+    assert batch.qpos.item() == data.qpos[0]
+    assert batch.qvel.item() == data.qvel[0]

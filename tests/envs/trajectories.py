@@ -1,0 +1,35 @@
+"""Trajectories to compare with: SciPy's DOP853 on a task's equations of motion."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.integrate import solve_ivp
+
+import envs
+
+
+def simulated(task: str, start: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """States [T + 1, nq + nv] of an environment without noise from `start` under actions [T, da]."""
+    env = envs.make(task, velocity_noise=0.0, dtype=torch.float64)
+    qpos, qvel = torch.from_numpy(start).split([env.qpos.shape[-1], env.qvel.shape[-1]])
+    data = env.place(qpos[None, None], qvel[None, None])
+    states = [start]
+    for action in actions:
+        data["action"] = torch.as_tensor(action).reshape(env.action_spec.shape)
+        data = env.step(data)["next"]
+        states.append(torch.cat([env.qpos, env.qvel], -1).flatten().numpy())
+    return np.stack(states)
+
+
+def integrated(
+    rates: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.ndarray, actions: np.ndarray, step: float
+) -> np.ndarray:
+    """States [T + 1, n] of ẋ = rates(x, u) with each action held for `step` seconds."""
+    states = [start]
+    for action in actions:
+        solution = solve_ivp(
+            lambda _, x, u=action: rates(x, u), (0, step), states[-1], "DOP853", rtol=1e-10, atol=1e-10
+        )
+        states.append(solution.y[:, -1])
+    return np.stack(states)

@@ -19,8 +19,10 @@ def rates(x, u):
 def one_step(task: str, θ: float, ω: float, u: float):
     """The state and the output after one step from (θ, ω)."""
     env = envs.make(task, velocity_noise=0.0, dtype=torch.float64, info=True)
-    data = env.place(torch.full((1, 1, 1), θ).double(), torch.full((1, 1, 1), ω).double())
-    data["action"] = torch.full((1, 1, 1), u).double()
+    data = env.place(
+        torch.full((1, 1, 1), θ, dtype=torch.float64), torch.full((1, 1, 1), ω, dtype=torch.float64)
+    )
+    data["action"] = torch.full((1, 1, 1), u, dtype=torch.float64)
     out = env.step(data)["next"]
     return env.qpos.item(), env.qvel.item(), out
 

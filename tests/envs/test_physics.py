@@ -26,7 +26,7 @@ def test_the_stripped_model_moves_as_the_whole_one_bit_for_bit():
     data.qpos[:] = 1
     for step in range(500):
         control = np.sin(step)
-        batch.advance(torch.full((1, 1), control).double())
+        batch.advance(torch.full((1, 1), control, dtype=torch.float64))
         data.ctrl[:] = control
         mujoco.mj_step(whole, data)
     assert batch.qpos.item() == data.qpos[0]

@@ -1,5 +1,6 @@
 """Gaussian processes: the sparse online one, and the plain twins that it is tested against."""
 
+from torch_gprl.gp.evidence import fit_hyperparameters
 from torch_gprl.gp.exact import ExactGP
 from torch_gprl.gp.posterior import Posterior
 from torch_gprl.gp.pruning import BasisStatistics, InformationScore, PruningScore
@@ -14,4 +15,5 @@ __all__ = [
     "PruningScore",
     "RecursiveGP",
     "SparseOnlineGP",
+    "fit_hyperparameters",
 ]

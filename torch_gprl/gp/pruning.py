@@ -8,7 +8,7 @@ deletion in whitened coordinates, where the basis values are u = L w and the pos
 | L | `gram_factor` | Cholesky factor of the Gram matrix of the basis |
 | A, b | `precision`, `information` | posterior precision of w, and precision times mean |
 | Q_ii | `gram_inverse_diagonal` | diagonal of K⁻¹ |
-| Q_ii + C_ii | `posterior_precision_diagonal` | diagonal of the inverse posterior covariance seen from the basis |
+| Q_ii + C_ii | `posterior_precision_diagonal` | diagonal of L⁻ᵀA⁻¹L⁻¹ |
 """
 
 from typing import Literal, NamedTuple, Protocol

@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 class Selection(NamedTuple):
-    """Up to J points of a block of N that join the basis; `accepted` entries form a prefix for each learner."""
+    """Up to J points of a block of N that join the basis; `accepted` entries form a prefix."""
 
     pivots: Int[Tensor, "*batch J"]
     accepted: Bool[Tensor, "*batch J"]
@@ -36,7 +36,7 @@ def select_novel(
         limit: most points to pick, per learner [*batch].
 
     Returns:
-        the picks in order, the new rows of Φ, and the novelty that is left. One host synchronisation per pick.
+        the picks in order, the new rows of Φ, and the novelty that is left. One host synchronisation a pick.
     """
     points = novelty.shape[-1]
     rows = residual_gram.new_zeros((*novelty.shape[:-1], 0, points))

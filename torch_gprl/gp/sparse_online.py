@@ -5,8 +5,8 @@ else. With φ(x) = L⁻¹k(X_B, x), prior w ~ N(0, I) and ν(x) = k(x, x) − φ
 
     A = I + Σ φφᵀ/(σ0² + ν),   b = Σ φ y/(σ0² + ν),   w | data ~ N(A⁻¹b, A⁻¹).
 
-Sums over data: a block of points is one matrix product, their order does not matter, learners merge by adding.
-Sources: Csató and Opper (2002), "Sparse on-line Gaussian processes"; the thesis' equations (.5), (.6), (.9) to
+Sums over data: a block of points is one matrix product, their order does not matter, learners merge by
+adding. Sources: Csató and Opper (2002), "Sparse on-line Gaussian processes"; the thesis' equations (.5) to
 (.13). The textbook recursion in α, C and K⁻¹, which loses its digits, is `RecursiveGP`.
 
 | paper | here | meaning |
@@ -51,8 +51,8 @@ class SparseOnlineGP(nn.Module):
         pruning: score of the basis vectors, the smallest go; `InformationScore()` unless told.
         projection: `"moment"` keeps the posterior of the basis values exact when a point is projected or a
             vector deleted (FITC); `"dtc"` is the overconfident form of Csató's toolbox.
-        order: `"novelty"` picks new basis vectors from a block by largest novelty; `"arrival"` takes the points
-            one by one, as the textbook recursion does.
+        order: `"novelty"` picks new basis vectors from a block by largest novelty; `"arrival"` takes the
+            points one by one, as the textbook recursion does.
         overshoot: vectors above the budget that may gather before a round of pruning takes them at once;
             min(budget / 4, 64) unless told. 1 prunes after every addition.
 
@@ -141,7 +141,7 @@ class SparseOnlineGP(nn.Module):
         return _solve(self.gram_factor.mT, self.weights.unsqueeze(-1), upper=True).squeeze(-1)
 
     @property
-    def C(self) -> Float[Tensor, "*batch B B"]:  # noqa: N802 (Csató's letter)
+    def C(self) -> Float[Tensor, "*batch B B"]:
         """C = L⁻ᵀ(A⁻¹ − I)L⁻¹ ⪯ 0, Csató's sign: the variance is k(x, x) + k(x, X_B) C k(X_B, x)."""
         self.refresh()
         inverse_factor = self._inverse_gram_factor()
@@ -149,7 +149,7 @@ class SparseOnlineGP(nn.Module):
         return half.mT @ half - inverse_factor.mT @ inverse_factor
 
     def posterior(self, inputs: Float[Tensor, "*#batch N D"]) -> Posterior:
-        """Mean and variance of f at `inputs` (without noise), each [*batch, N]; differentiable in `inputs`."""
+        """Mean and variance of f (without noise) at `inputs`, [*batch, N] each; differentiable in them."""
         self.refresh()
         inputs = admit_inputs(inputs, self.batch_shape, self.basis)
         phi = self._features(inputs)
@@ -182,10 +182,10 @@ class SparseOnlineGP(nn.Module):
         )
 
     def log_marginal_likelihood(self) -> Float[Tensor, "*batch"]:
-        """log p(targets) of the streaming model [*batch]: −½ log|A| + ½ bᵀA⁻¹b plus the data's own constant.
+        """Log p(targets) of the streaming model [*batch]: −½ log|A| + ½ bᵀA⁻¹b plus the data's own constant.
 
-        Exact for the dense GP when nothing was projected, the FITC evidence on a fixed basis. Differentiable in
-        the kernel's parameters, with the pseudo-likelihood of the basis held fixed.
+        Exact for the dense GP when nothing was projected, the FITC evidence on a fixed basis. Differentiable
+        in the kernel's parameters, with the pseudo-likelihood of the basis held fixed.
         """
         gram_factor = cholesky(self._gram())
         precision, information = self._whiten(gram_factor)
@@ -312,8 +312,9 @@ class SparseOnlineGP(nn.Module):
         """
         if not (torch.equal(self.size, other.size) and torch.equal(self.basis, other.basis)):
             raise ValueError(
-                f"merge needs one basis shared by both, got sizes {self.size.tolist()} and {other.size.tolist()} "
-                "with different vectors; start both from the same basis (load_state_dict), then update each"
+                f"merge needs one basis shared by both, got sizes {self.size.tolist()} and "
+                f"{other.size.tolist()} with different vectors; start both from the same basis "
+                "(load_state_dict), then update each"
             )
         self.precision.add_(other.precision)
         self.precision.diagonal(dim1=-2, dim2=-1).sub_(1)

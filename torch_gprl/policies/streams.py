@@ -1,0 +1,61 @@
+"""Random numbers by learner: what learner i draws does not depend on how many others learn beside it."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+LEARNER_STRIDE = (
+    1_000_003  # keeps the seeds of (seed, learner) pairs apart; a prime above any count of learners
+)
+
+
+def learner_generators(seed: int, learners: Sequence[int]) -> list[torch.Generator]:
+    """One CPU generator for each learner index, seeded by the pair (seed, learner)."""
+    return [torch.Generator().manual_seed(seed * LEARNER_STRIDE + index) for index in learners]
+
+
+def stacked_normal(generators: Sequence[torch.Generator], shape: Sequence[int]) -> Tensor:
+    """Standard normal numbers [len(generators), *shape], row i from generator i."""
+    return torch.stack([torch.randn(tuple(shape), generator=generator) for generator in generators])
+
+
+class NoiseStream:
+    """Standard normal noise for a policy, drawn a block of steps at a time from one generator per learner.
+
+    A block costs one call per learner, a step costs an index. `state()` and `restore()` continue a stream
+    exactly where it stood.
+    """
+
+    BLOCK = 64  # steps drawn at once
+
+    def __init__(self, seed: int, learners: Sequence[int]) -> None:
+        self._generators = learner_generators(seed, learners)
+        self._block: Tensor | None = None
+        self._next = 0
+
+    def __len__(self) -> int:
+        """Number of learners."""
+        return len(self._generators)
+
+    def draw(self, like: Tensor) -> Tensor:
+        """Noise in the shape, dtype and on the device of `like` [learners, ...]."""
+        if self._block is None or self._next == self.BLOCK or self._block.shape[2:] != like.shape[1:]:
+            self._block = stacked_normal(self._generators, (self.BLOCK, *like.shape[1:])).to(like)
+            self._next = 0
+        noise = self._block[:, self._next]
+        self._next += 1
+        return noise
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors that `restore` takes."""
+        block = torch.zeros(0) if self._block is None else self._block.cpu()
+        states = torch.stack([generator.get_state() for generator in self._generators])
+        return {"generators": states, "block": block, "next": torch.tensor(self._next)}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Continue where the stream stood when `state` was taken."""
+        for generator, saved in zip(self._generators, state["generators"], strict=True):
+            generator.set_state(saved)
+        self._block = state["block"] if state["block"].numel() else None
+        self._next = int(state["next"])

@@ -84,7 +84,9 @@ class PolicyGradient:
         self.learners, num_envs = env.batch_size
         indices = range(first_learner, first_learner + self.learners)
         dims = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
-        controller = _controller(config.controller, *dims, indices, seed)
+        controller = _controller(config.controller, *dims, indices, seed).to(
+            env.observation_spec["observation"].dtype
+        )
         self.policy = gaussian_policy(controller, env.action_spec, config.std, seed, learners=indices).to(
             env.device
         )

@@ -38,7 +38,7 @@ class GaussianHead(TensorDictModuleBase):
         self.register_buffer("centre", (high + low) / 2)
         self.register_buffer("half_range", (high - low) / 2)
         shape = (*controller.batch_shape, controller.action_dim)
-        self.log_std = nn.Parameter(torch.full(shape, std).log())
+        self.log_std = nn.Parameter(high.new_full(shape, std).log())
 
     def parameters_at(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation [*batch, ..., A] of the action at observations [*batch, ..., D]."""
@@ -136,4 +136,4 @@ def _bounds(action_spec: TensorSpec, dims: int) -> tuple[Tensor, Tensor]:
     space = action_spec.space
     if not isinstance(space, ContinuousBox) or not bool(torch.isfinite(space.high - space.low).all()):
         raise ValueError(f"the action spec must be bounded on both sides, got {action_spec}")
-    return space.low.reshape(-1, dims)[0].float(), space.high.reshape(-1, dims)[0].float()
+    return space.low.reshape(-1, dims)[0], space.high.reshape(-1, dims)[0]

@@ -202,8 +202,8 @@ def train(learner: PolicyGradient, options: PolicyGradientOptions, folder: RunFo
         Progress(options.algorithm.total_frames, title) as progress,
     ):
         for values in learner.train():
-            metrics.write(learner.updates, values)
-            progress.update(values)
+            metrics.write(learner.updates, learner.frames, values)
+            progress.update(learner.frames, values)
             if time.monotonic() - last_saved > CHECKPOINT_INTERVAL:
                 checkpoints.save(learner.updates)
                 last_saved = time.monotonic()
@@ -272,9 +272,10 @@ def value_on_plane(learner: PolicyGradient, plane: envs.Plane, best: int) -> Sur
     learners = len(gp.size)
     x, y = (torch.linspace(low, high, GRID) for low, high in zip(plane.low, plane.high, strict=True))
     points = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2).to(gp.basis.device)
+    observations = plane.to_observation(points).float()
     means, variances = [], []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        for some in plane.to_observation(points).float().split(POINTS_AT_ONCE):
+        for some in observations.split(POINTS_AT_ONCE):
             states = TensorDict(
                 {"observation": some.expand(learners, -1, -1)}, batch_size=(learners, len(some))
             )
@@ -282,7 +283,7 @@ def value_on_plane(learner: PolicyGradient, plane: envs.Plane, best: int) -> Sur
             means.append(value.mean[best])
             variances.append(value.variance[best])
     basis = gp.basis[best, : int(gp.size[best])] * critic.input_scale[best] + critic.input_loc[best]
-    observed = basis[:, : states["observation"].shape[-1]]
+    observed = basis[:, : observations.shape[-1]]
     return Surface(
         x=x.double().numpy(),
         y=y.double().numpy(),

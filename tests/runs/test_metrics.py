@@ -11,8 +11,8 @@ from torch_gprl.runs import MetricsWriter, UserError, read_metrics
 
 def an_update(frames: int) -> dict[str, torch.Tensor]:
     return {
-        "frames": torch.full((3,), frames),
         "return": torch.tensor([1.0, 2.0, 6.0], dtype=torch.float64) * frames / 7,
+        "basis_size": torch.full((3,), 50),
     }
 
 
@@ -20,15 +20,15 @@ def an_update(frames: int) -> dict[str, torch.Tensor]:
 def written(tmp_path):
     """A table of two updates of three learners, not closed: as a killed process leaves it."""
     writer = MetricsWriter(tmp_path / "metrics.csv", tmp_path / "tensorboard")
-    writer.write(1, an_update(100))
-    writer.write(2, an_update(200))
+    writer.write(1, 100, an_update(100))
+    writer.write(2, 200, an_update(200))
     yield tmp_path
     writer.close()
 
 
 def test_every_update_is_on_disk_at_once_and_exact(written):
     metrics = read_metrics(written / "metrics.csv")
-    assert metrics.keys() == {"update", "frames", "return"}
+    assert metrics.keys() == {"update", "frames", "return", "basis_size"}
     assert metrics["update"].tolist() == [[1] * 3, [2] * 3]
     assert metrics["return"].tolist() == [
         an_update(100)["return"].tolist(),
@@ -38,8 +38,15 @@ def test_every_update_is_on_disk_at_once_and_exact(written):
 
 def test_a_row_is_an_update_and_a_learner(written):
     lines = (written / "metrics.csv").read_text(encoding="utf-8").splitlines()
-    assert lines[0] == "update,learner,frames,return"
-    assert [line.rsplit(",", 2)[0] for line in lines[1:]] == ["1,0", "1,1", "1,2", "2,0", "2,1", "2,2"]
+    assert lines[0] == "update,frames,learner,return,basis_size"
+    assert [line.rsplit(",", 2)[0] for line in lines[1:]] == [
+        "1,100,0",
+        "1,100,1",
+        "1,100,2",
+        "2,200,0",
+        "2,200,1",
+        "2,200,2",
+    ]
 
 
 @pytest.mark.parametrize("lost", [1, 12, 40])
@@ -51,7 +58,7 @@ def test_an_update_that_was_cut_off_is_left_out(written, lost):
 
 def test_tensorboard_shows_the_mean_and_each_learner(tmp_path):
     writer = MetricsWriter(tmp_path / "metrics.csv", tmp_path / "tensorboard")
-    writer.write(1, an_update(70))
+    writer.write(1, 70, an_update(70))
     writer.close()
     values = {}
     for run in ("mean", "learner-0", "learner-1", "learner-2"):
@@ -65,15 +72,15 @@ def test_tensorboard_shows_the_mean_and_each_learner(tmp_path):
 
 def test_a_metric_that_comes_late_is_refused(written):
     writer = MetricsWriter(written / "other.csv", written / "other")
-    writer.write(1, an_update(100))
+    writer.write(1, 100, an_update(100))
     with pytest.raises(ValueError, match="names of the first update"):
-        writer.write(2, {**an_update(200), "surprise": torch.zeros(3)})
+        writer.write(2, 200, {**an_update(200), "surprise": torch.zeros(3)})
     writer.close()
 
 
 def test_not_a_number_survives(tmp_path):
     writer = MetricsWriter(tmp_path / "metrics.csv", tmp_path / "tensorboard")
-    writer.write(1, {"frames": torch.tensor([5]), "return": torch.tensor([math.nan])})
+    writer.write(1, 5, {"return": torch.tensor([math.nan])})
     writer.close()
     assert math.isnan(read_metrics(tmp_path / "metrics.csv")["return"].item())
 

@@ -18,13 +18,11 @@ class Clock:
         return self.now
 
 
-def an_update(frames: int) -> dict[str, torch.Tensor]:
-    return {
-        "frames": torch.tensor([frames, frames]),
-        "return": torch.tensor([10.0, 14.0]),
-        "sigma": torch.tensor([0.5, 0.5]),
-        "basis_size": torch.tensor([100, 100]),
-    }
+UPDATE = {
+    "return": torch.tensor([10.0, 14.0]),
+    "sigma": torch.tensor([0.5, 0.5]),
+    "basis_size": torch.tensor([100, 100]),
+}
 
 
 def shown(terminal: bool, times: list[float]) -> str:
@@ -34,7 +32,7 @@ def shown(terminal: bool, times: list[float]) -> str:
     with Progress(1000, "pendulum", console=console, clock=clock) as progress:
         for number, seconds in enumerate(times, start=1):
             clock.now = 1000.0 + seconds
-            progress.update(an_update(100 * number))
+            progress.update(100 * number, UPDATE)
     return console.file.getvalue()
 
 
@@ -64,7 +62,7 @@ def test_a_terminal_shows_the_panel():
 def test_a_run_without_exploration_or_basis_is_shown_too():
     console = Console(file=io.StringIO(), force_terminal=False, width=100)
     with Progress(100, "baseline", console=console, clock=Clock()) as progress:
-        progress.update({"frames": torch.tensor([100]), "return": torch.tensor([3.0])})
+        progress.update(100, {"return": torch.tensor([3.0])})
     assert "return 3  steps/s" in console.file.getvalue()
 
 

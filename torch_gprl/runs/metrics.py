@@ -16,7 +16,7 @@ class MetricsWriter:
     """Writes one row per update and learner, and the same numbers as TensorBoard events.
 
     Each learner, and their mean, is a TensorBoard run of its own, so that one chart overlays all curves. The
-    events' steps are environment steps, taken from the metric `frames`.
+    events' steps are environment steps.
 
     Args:
         csv_path: the table; its header is fixed by the first update.
@@ -30,27 +30,30 @@ class MetricsWriter:
         self._names: list[str] = []
         self._loggers: list[TensorboardLogger] = []
 
-    def write(self, update: int, metrics: Mapping[str, Tensor]) -> None:
+    def write(self, update: int, frames: int, metrics: Mapping[str, Tensor]) -> None:
         """Append one update.
 
         Args:
             update: number of the policy update.
-            metrics: name -> values `[learners]`; `frames` (environment steps per learner) is among them.
+            frames: environment steps per learner so far.
+            metrics: name -> values `[learners]`.
 
         Raises:
             ValueError: if the names differ from those of the first update.
         """
         columns = {name: values.tolist() for name, values in metrics.items()}
         if not self._names:
-            self._start(list(columns), learners=len(columns["frames"]))
+            self._start(list(columns), learners=len(next(iter(columns.values()))))
         if list(columns) != self._names:
             raise ValueError(
                 f"metrics must have the names of the first update, {self._names}; got {list(columns)}"
             )
         rows = zip(*columns.values(), strict=True)
-        self._table.writerows((update, learner, *row) for learner, row in enumerate(rows))
+        self._table.writerows((update, frames, learner, *row) for learner, row in enumerate(rows))
         self._file.flush()
-        self._log_events(columns)
+        for name, values in columns.items():
+            for logger, value in zip(self._loggers, [float(np.mean(values)), *values], strict=True):
+                logger.log_scalar(name, value, step=frames)
 
     def close(self) -> None:
         """Close the table and the events."""
@@ -60,15 +63,9 @@ class MetricsWriter:
 
     def _start(self, names: list[str], learners: int) -> None:
         self._names = names
-        self._table.writerow(["update", "learner", *names])
+        self._table.writerow(["update", "frames", "learner", *names])
         runs = ["mean", *(f"learner-{learner}" for learner in range(learners))]
         self._loggers = [TensorboardLogger(run, log_dir=str(self._tensorboard)) for run in runs]
-
-    def _log_events(self, columns: Mapping[str, list[float]]) -> None:
-        frames = int(columns["frames"][0])
-        for name, values in columns.items():
-            for logger, value in zip(self._loggers, [float(np.mean(values)), *values], strict=True):
-                logger.log_scalar(name, value, step=frames)
 
 
 def read_metrics(csv_path: Path) -> dict[str, Float[np.ndarray, "updates learners"]]:
@@ -80,7 +77,7 @@ def read_metrics(csv_path: Path) -> dict[str, Float[np.ndarray, "updates learner
         csv_path: the table.
 
     Returns:
-        name -> values `[updates, learners]`, float64; `update` is among the names.
+        name -> values `[updates, learners]`, float64; `update` and `frames` are among the names.
 
     Raises:
         UserError: if the file is missing or is no such table.

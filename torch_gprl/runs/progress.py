@@ -49,14 +49,14 @@ class Progress:
     ) -> None:
         self._live.stop()
 
-    def update(self, metrics: Mapping[str, Tensor]) -> None:
+    def update(self, frames: int, metrics: Mapping[str, Tensor]) -> None:
         """Show an update.
 
         Args:
-            metrics: name -> values `[learners]`; `frames` (environment steps per learner) is among them.
+            frames: environment steps per learner so far.
+            metrics: name -> values `[learners]`; `return` is among them.
         """
-        now = self._clock()
-        frames, learners = int(metrics["frames"][0]), len(metrics["frames"])
+        now, learners = self._clock(), len(metrics["return"])
         speed = frames / max(now - self._start, 1e-9)  # steps per second and learner
         facts = {label: _mean_and_spread(metrics[name]) for name, label in SHOWN.items() if name in metrics}
         facts["steps/s"] = f"{speed * learners:,.0f}"

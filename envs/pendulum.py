@@ -13,13 +13,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from envs.philox import StartDraws
-from envs.physics import MujocoPhysics, State, stripped
+from envs.physics import MujocoPhysics, State
 from envs.task import Noise, Plane, Reward, Task
 
 MODEL = Path(__file__).with_suffix(".xml")
 MAX_TORQUE = 5.0  # N m
-CONTROL_STEP = 0.05  # s
-SUBSTEPS = 2  # physics steps of 0.025 s in a control step
+PHYSICS_STEP = 0.025  # s
 EFFORT_WEIGHT = 0.001  # reward per (N m)²
 HANGING_STD = 0.1  # rad, spread of the start around hanging
 BALANCE_START = 0.2  # rad and rad/s, half width of the start around upright
@@ -62,7 +61,7 @@ PLANE = Plane(
 class Pendulum(Task):
     """What the three pendulum tasks share: the system, and the observation (cos θ, sin θ, ω)."""
 
-    control_step: float = CONTROL_STEP
+    control_step: float = 0.05
     action_low: tuple[float, ...] = (-MAX_TORQUE,)
     action_high: tuple[float, ...] = (MAX_TORQUE,)
     plane: Plane | None = PLANE
@@ -70,9 +69,7 @@ class Pendulum(Task):
 
     def physics(self, copies: int, threads: int) -> MujocoPhysics:
         """MuJoCo's pendulum under Runge-Kutta's fourth-order rule."""
-        model = stripped(MODEL)
-        model.opt.timestep = CONTROL_STEP / SUBSTEPS
-        return MujocoPhysics(model, copies, SUBSTEPS, threads)
+        return MujocoPhysics.of_ours(MODEL, self.control_step, PHYSICS_STEP, copies, threads)
 
     def observation(self, state: State) -> Float[Tensor, "B 3"]:
         """(cos θ, sin θ, ω in rad/s)."""

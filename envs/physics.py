@@ -8,7 +8,8 @@ simulations would, on any number of threads; torch views the same memory.
 # (mujoco takes its names from compiled modules, which pyright cannot read)
 
 import abc
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -103,6 +104,16 @@ class MujocoPhysics(Physics):
         self._past = State(self._before[:, qpos], self._before[:, qvel])
         self.derived = {name: torch.from_numpy(self.batch.bind(name)) for name in derived}
 
+    @classmethod
+    def of_ours(
+        cls, path: Path, control_step: float, physics_step: float, copies: int, threads: int
+    ) -> "MujocoPhysics":
+        """Copies of one of our own models, `stripped`, with physics steps of at most `physics_step` s."""
+        model = stripped(path)
+        substeps = math.ceil(control_step / physics_step - 1e-9)  # the quotient of equal steps may round up
+        model.opt.timestep = control_step / substeps
+        return cls(model, copies, substeps, threads)
+
     def _columns(self, field: str) -> slice:
         """Where a field of MjData lies in the state rows."""
         view = self.batch.bind(field)
@@ -139,6 +150,55 @@ class MujocoPhysics(Physics):
         self.rows[rows] = self._before[rows]
 
 
+class TorchPhysics(Physics):
+    """Copies of a system given by its equations, as one batched function.
+
+    Args:
+        transition: (qpos [B, nq], qvel [B, nv], control [B, nu]) -> the positions and velocities one control
+            step later.
+        copies: how many, B.
+        sizes: nq and nv.
+    """
+
+    def __init__(
+        self,
+        transition: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
+        copies: int,
+        sizes: tuple[int, int],
+    ) -> None:
+        self._transition = transition
+        self.rows = torch.zeros(copies, sum(sizes), dtype=torch.float64)
+        self._before = self.rows.clone()
+        self.qpos, self.qvel = self.rows.split(sizes, dim=1)
+        past_qpos, past_qvel = self._before.split(sizes, dim=1)
+        self._past = State(past_qpos, past_qvel)
+        self.derived = {}
+
+    def advance(self, control: Float[Tensor, "B nu"]) -> State:
+        """Apply the transition; see `Physics.advance`."""
+        self._before.copy_(self.rows)
+        qpos, qvel = self._transition(self._past.qpos, self._past.qvel, control)
+        self.qpos.copy_(qpos)
+        self.qvel.copy_(qvel)
+        return self._past
+
+    def place(self, rows: NDArray[np.intp], qpos: Float[Tensor, "R nq"], qvel: Float[Tensor, "R nv"]) -> None:
+        """Write the states; see `Physics.place`."""
+        index = torch.from_numpy(rows)
+        self.qpos[index] = qpos
+        self.qvel[index] = qvel
+
+    def diverged(self) -> Bool[Tensor, " B"] | None:
+        """Where a number is not finite or beyond `LARGEST`; see `Physics.diverged`."""
+        if self.rows.abs().max() <= LARGEST:  # NaN fails the test
+            return None
+        return ~(self.rows.abs().amax(dim=1) <= LARGEST)
+
+    def restore(self, rows: Bool[Tensor, " B"]) -> None:
+        """Put back the state before the last step; see `Physics.restore`."""
+        self.rows[rows] = self._before[rows]
+
+
 def stripped(path: Path) -> mujoco.MjModel:
     """The model of a file without what only the eye needs: geoms, lights, cameras, sites, drawn ropes.
 
@@ -146,7 +206,8 @@ def stripped(path: Path) -> mujoco.MjModel:
     whole model to the last bit; a step is cheaper because nothing is placed that nobody looks at.
     """
     spec = mujoco.MjSpec.from_file(str(path))
-    for group in (spec.geoms, spec.lights, spec.cameras, spec.tendons, spec.sites):
+    moved_by_hand = [body for body in spec.bodies if body.mocap]
+    for group in (spec.tendons, spec.geoms, spec.lights, spec.cameras, spec.sites, moved_by_hand):
         for element in group:
             spec.delete(element)
     return spec.compile()

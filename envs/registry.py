@@ -2,12 +2,15 @@
 
 import difflib
 
-from envs import pendulum
+from envs import atwood, car_on_hill, cartpole, crane, pendulum
 from envs.batch import BatchEnv
 from envs.copies import Options
 from envs.task import Task
 
-ALL: dict[str, Task] = {task.id: task for task in (*pendulum.TASKS,)}
+ALL: dict[str, Task] = {
+    task.id: task
+    for task in (*pendulum.TASKS, *cartpole.TASKS, *atwood.TASKS, *crane.TASKS, *car_on_hill.TASKS)
+}
 
 
 def find(task_id: str) -> Task:

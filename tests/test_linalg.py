@@ -33,6 +33,14 @@ def test_only_the_entries_that_fail_get_jitter():
     assert (added < 1e-11).all()
 
 
+def test_jitter_grows_no_further_than_needed():
+    basis, _ = torch.linalg.qr(torch.randn(4, 4, dtype=torch.float64))
+    matrix = basis @ torch.diag(torch.tensor([1.0, 1.0, 1.0, -1e-10], dtype=torch.float64)) @ basis.mT
+    factor = cholesky(matrix)
+    added = (factor @ factor.mT - matrix).diagonal().mean()
+    assert 1e-10 < added < 1e-9
+
+
 def test_jitter_scales_with_the_matrix():
     matrix = singular()
     torch.testing.assert_close(cholesky(1e8 * matrix), 1e4 * cholesky(matrix), rtol=1e-4, atol=1e-3)

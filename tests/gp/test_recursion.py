@@ -20,8 +20,13 @@ def sample(count: int) -> tuple[Tensor, Tensor]:
     return inputs, inputs.sin().sum(-1) + NOISE**0.5 * torch.randn(count, dtype=torch.float64)
 
 
-def recursion(budget: int = 100, threshold: float = 0.0, **options: str) -> RecursiveGP:
-    return RecursiveGP(KERNEL, budget, NOISE, threshold, **options)  # type: ignore[arg-type]
+def recursion(
+    budget: int = 100,
+    threshold: float = 0.0,
+    projection: Projection = "moment",
+    score: Literal["mean", "kl"] = "mean",
+) -> RecursiveGP:
+    return RecursiveGP(KERNEL, budget, NOISE, threshold, projection, score)
 
 
 def trained(count: int = 30, projection: Projection = "moment", threshold: float = 0.5) -> RecursiveGP:
@@ -127,6 +132,14 @@ def test_repeats_of_one_input_average_and_shrink():
     gp.update(point.expand(3, 2), targets)
     assert gp.size == 1  # a seen point is not novel
     assert gp.posterior(point).mean.item() == pytest.approx(3.0 / (3 + NOISE / 1.5))  # Σy/(n + σ²/A)
+
+
+@pytest.mark.parametrize(("distance", "size"), [(1e-4, 2), (1e-6, 1)])
+def test_without_a_threshold_roundoff_still_adds_no_basis_vector(distance: float, size: int):
+    point, target = sample(1)
+    gp = recursion(threshold=0.0)
+    gp.update(torch.cat([point, point + distance]), target.expand(2))  # novelty about 3 · distance²
+    assert gp.size == size
 
 
 def test_a_point_joins_the_basis_just_above_the_threshold_and_not_just_below():

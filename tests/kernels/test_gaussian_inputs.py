@@ -94,6 +94,11 @@ def test_without_variance_the_average_is_the_kernel(kernel: Kernel):
     assert torch.equal(kernel.expected(GaussianInputs.exactly(x), z), kernel(x, z))
 
 
+def test_no_points_have_an_empty_average(kernel: Kernel):
+    assert kernel.expected(uncertain(2), torch.zeros(0, DIM, dtype=torch.float64)).shape[-2:] == (2, 0)
+    assert kernel.expected(uncertain(0), torch.zeros(3, DIM, dtype=torch.float64)).shape[-2:] == (0, 3)
+
+
 def test_far_from_the_origin_the_average_keeps_its_digits():
     kernel, x, z = SquaredExponential(DIM), uncertain(4), torch.randn(3, DIM, dtype=torch.float64)
     moved = GaussianInputs(x.mean + 1e5, x.variance, GAUSSIAN)

@@ -6,9 +6,8 @@ differentiable in them.
 
 | paper | here | meaning |
 |---|---|---|
-| X, y | `inputs`, `targets` | the data |
+| X, y | `self.inputs`, `self.targets` | the data |
 | L | `L` | Cholesky factor of K(X, X) + σ²I |
-| X* | `points` | where f is asked for |
 """
 
 import math
@@ -54,19 +53,19 @@ class ExactGP(nn.Module):
         self.inputs, self.targets = inputs.to(self.log_noise_variance), targets.to(self.log_noise_variance)
         return self
 
-    def posterior(self, points: Inputs) -> Posterior:
-        """Mean and variance of f at points [*batch, M, D]."""
+    def posterior(self, inputs: Inputs) -> Posterior:
+        """Mean and variance of f at inputs [*batch, M, D]."""
         L, whitened_targets = self._whiten()
-        A = torch.linalg.solve_triangular(L, self.kernel(self.inputs, points), upper=False)
+        A = torch.linalg.solve_triangular(L, self.kernel(self.inputs, inputs), upper=False)
         # mean = k*ᵀ(K + σ²I)⁻¹y,  variance = k** − k*ᵀ(K + σ²I)⁻¹k*
         mean = (A.mT @ whitened_targets).squeeze(-1)
-        return Posterior(mean, self.kernel.diag(points) - A.square().sum(-2))
+        return Posterior(mean, self.kernel.diag(inputs) - A.square().sum(-2))
 
-    def joint(self, points: Inputs) -> MultivariateNormal:
-        """Joint distribution of f at points [*batch, M, D], to draw whole functions from."""
+    def joint(self, inputs: Inputs) -> MultivariateNormal:
+        """Joint distribution of f at inputs [*batch, M, D], to draw whole functions from."""
         L, whitened_targets = self._whiten()
-        A = torch.linalg.solve_triangular(L, self.kernel(self.inputs, points), upper=False)
-        covariance = self.kernel(points, points) - A.mT @ A
+        A = torch.linalg.solve_triangular(L, self.kernel(self.inputs, inputs), upper=False)
+        covariance = self.kernel(inputs, inputs) - A.mT @ A
         return MultivariateNormal((A.mT @ whitened_targets).squeeze(-1), scale_tril=cholesky(covariance))
 
     def log_marginal_likelihood(self) -> Float[Tensor, "*batch"]:

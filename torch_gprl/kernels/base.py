@@ -92,12 +92,12 @@ class Kernel(nn.Module, ABC):
 
     def log_prior(self) -> Tensor:
         """Log density of all parameters with a prior, of this kernel and of its parts: [*batch_shape]."""
-        total = torch.zeros(self.batch_shape, dtype=torch.float64)
+        total = next(self.parameters()).new_zeros(self.batch_shape)
         for kernel in self.modules():
             if isinstance(kernel, Kernel):
                 for name, prior in kernel.priors.items():
                     log_density = prior.log_prob(getattr(kernel, name))
-                    total = total.to(log_density) + log_density.reshape(*kernel.batch_shape, -1).sum(-1)
+                    total = total + log_density.reshape(*kernel.batch_shape, -1).sum(-1)
         return total
 
     def __add__(self, other: "Kernel") -> "Kernel":

@@ -52,10 +52,24 @@ def _by_differences(x: Tensor, z: Tensor, log_lengthscale: Tensor, offset: Tenso
 
 def _by_matrix_product(x: Tensor, z: Tensor, log_lengthscale: Tensor, offset: Tensor | None) -> Tensor:
     weight = log_lengthscale.mul(-2.0).exp_().unsqueeze(-2)  # ℓ⁻²
-    if x.shape[-2] and z.shape[-2]:
-        centre = z[..., :1, :].detach()
-        x, z = x - centre, z - centre
+    x, z = _centred(x, z)
     x_norm = x.square() @ weight.mT
     z_norm = weight @ z.square().mT
     row = z_norm.mul(-0.5) if offset is None else torch.sub(offset, z_norm, alpha=0.5)
     return (x @ (z * weight).mT).sub_(x_norm, alpha=0.5).add_(row)
+
+
+def weighted_square_distance(x: Inputs, z: OtherInputs, weight: Inputs) -> CrossMatrix:
+    """Compute Σ_d w_nd (x_nd − z_md)² [*batch, N, M] with weights [*batch, N, D] of each row of x."""
+    x, z = _centred(x.to(weight.dtype), z.to(weight.dtype))
+    weighted = weight * x
+    cross = torch.cat((weight.expand_as(weighted), weighted), -1) @ torch.cat((z.square(), -2 * z), -1).mT
+    return cross + (weighted * x).sum(-1, keepdim=True)
+
+
+def _centred(x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+    """Both sets moved so that the first point of z is the origin; no distance changes."""
+    if x.shape[-2] == 0 or z.shape[-2] == 0:
+        return x, z
+    centre = z[..., :1, :].detach()
+    return x - centre, z - centre

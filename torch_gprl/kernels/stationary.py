@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torch_gprl.kernels.base import Kernel
-from torch_gprl.kernels.distance import log_gaussian
+from torch_gprl.kernels.distance import log_gaussian, weighted_square_distance
 from torch_gprl.kernels.gaussian_inputs import GaussianInputs
 from torch_gprl.kernels.parameters import Positive, PositiveValue, log_parameter, positive
 from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
@@ -76,7 +76,7 @@ class SquaredExponential(Stationary):
             square = ((x.mean.unsqueeze(-2) - z.mean.unsqueeze(-3)).square() / width).sum(-1)
             shrink = (width / square_lengthscale.unsqueeze(-2)).log().sum(-1)
         else:
-            square = _square_distance(x.mean, z.mean, 1 / width)
+            square = weighted_square_distance(x.mean, z.mean, 1 / width)
             shrink = (width / square_lengthscale).log().sum(-1, keepdim=True)
         return (self.log_outputscale[..., None, None] - 0.5 * (square + shrink)).exp()
 
@@ -163,7 +163,7 @@ class Periodic(Stationary):
 
     Args:
         input_dim: number of input columns D.
-        lengthscale: ℓ, on the unit circle: a third of it is about a twentieth of the period; broadcasts to
+        lengthscale: ℓ, in radians of phase: a small one acts as that of `SquaredExponential`; broadcasts to
             [*batch_shape, D].
         outputscale: σ², as `Stationary`.
         batch_shape: independent hyper-parameters, one set per learner.
@@ -195,12 +195,3 @@ class Periodic(Stationary):
     def _on_circle(self, x: Tensor) -> Tensor:
         phase = x * (2 * math.pi / self.period).unsqueeze(-2)
         return torch.cat((phase.cos(), phase.sin()), -1)
-
-
-def _square_distance(x: Tensor, z: Tensor, weight: Tensor) -> Tensor:
-    """Σ_d w_nd (x_nd − z_md)² [*batch, N, M] with weights [*batch, N, D] of each row of x, as one product."""
-    centre = z[..., :1, :].detach()
-    x, z = (x - centre).to(weight.dtype), (z - centre).to(weight.dtype)
-    weighted = weight * x
-    cross = torch.cat((weight.expand_as(weighted), weighted), -1) @ torch.cat((z.square(), -2 * z), -1).mT
-    return cross + (weighted * x).sum(-1, keepdim=True)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from scipy.integrate import solve_ivp
+from tensordict import TensorDictBase
 
 import envs
 
@@ -33,3 +34,12 @@ def integrated(
         )
         states.append(solution.y[:, -1])
     return np.stack(states)
+
+
+def after_a_step(task: str, start: list[float], action: float) -> tuple[envs.BatchEnv, TensorDictBase]:
+    """The environment and its output, in float64 and without noise, one step after (qpos, qvel) = `start`."""
+    env = envs.make(task, velocity_noise=0.0, dtype=torch.float64, info=True)
+    qpos, qvel = torch.tensor(start, dtype=torch.float64).split([env.qpos.shape[-1], env.qvel.shape[-1]])
+    data = env.place(qpos[None, None], qvel[None, None])
+    data["action"] = torch.full(env.action_spec.shape, action, dtype=torch.float64)
+    return env, env.step(data)["next"]

@@ -10,6 +10,7 @@ Ctrl-C ends a run early and keeps what was learned; a second Ctrl-C aborts at on
 import contextlib
 import io
 import os
+import re
 import signal
 import sys
 import time
@@ -49,6 +50,7 @@ CHECKPOINT_INTERVAL = 60.0  # s
 GRID = 61  # points of the value surface in each direction
 POINTS_AT_ONCE = 500  # of the value surface, for each learner: bounds the memory
 LONGEST_FILM = 300  # frames
+BOX_SIDES, BOX_RULES = "│| ", "─-"  # how tyro draws with UTF-8 and without
 
 
 @dataclass(frozen=True)
@@ -126,14 +128,15 @@ def parse(arguments: list[str]) -> tuple[str, PolicyGradientOptions]:
 
 
 def _one_line(box: str) -> str:
-    """The text of tyro's box without the box: its parts joined by semicolons."""
+    """The text of tyro's box without the box and its colours: its parts joined by semicolons."""
     parts: list[list[str]] = [[]]
-    for line in (line.strip("│ ") for line in box.splitlines() if line.startswith("│")):
-        if line.startswith("─"):
+    for line in re.sub(r"\x1b\[[\d;]*m", "", box).splitlines()[1:-1]:
+        words = line.strip(BOX_SIDES).split()
+        if set("".join(words)) <= set(BOX_RULES):
             parts.append([])
         else:
-            parts[-1].append(line)
-    return "; ".join(" ".join(" ".join(part).split()) for part in parts)
+            parts[-1] += words
+    return "; ".join(" ".join(part) for part in parts)
 
 
 def run(name: str, options: PolicyGradientOptions) -> None:

@@ -167,6 +167,15 @@ def test_a_mistake_gets_one_line_and_exit_code_2(arguments, tmp_path, capsys):
     assert re.search(MISTAKES[arguments], line)
 
 
+def test_a_mistake_on_a_coloured_terminal_is_plain(capsys, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    train.main(["--learners", "0"])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.isprintable()
+    assert "learners must be at least 1, not 0" in line
+
+
 def test_a_mistake_ends_the_process_with_code_2():
     process = start("--learners", "0")
     output, errors = process.communicate(timeout=120)
@@ -180,12 +189,12 @@ def test_help_explains_every_option(name, capsys):
     with pytest.raises(SystemExit) as end:
         train.main([name, "--help"])
     assert end.value.code == 0
-    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    shown = " ".join(re.sub(r"[│|]", " ", capsys.readouterr().out).split())
     options = train.ALGORITHMS[name].options()
     for field in [*dataclasses.fields(options.run), *dataclasses.fields(options.algorithm)]:
         flag = f"--{field.name.replace('_', '-')}"
         assert flag in shown
-        explanation = shown.split(f"{flag} ", 1)[1].split("(default", 1)[0]
+        explanation = shown.split(flag, 1)[1].split("(default", 1)[0]
         assert len(explanation.split()) > 3, f"{flag} is not explained"
 
 

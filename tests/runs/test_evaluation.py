@@ -41,8 +41,8 @@ class Countdown(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         pass
 
-    def render(self, learner: int, env: int) -> torch.Tensor:
-        return self.passed[learner, env].to(torch.uint8).expand(2, 2, 3)
+    def render(self, learner: int, env: int, width: int, height: int) -> torch.Tensor:
+        return self.passed[learner, env].to(torch.uint8).expand(height, width, 3)
 
 
 def policy(observation: torch.Tensor) -> torch.Tensor:

@@ -139,9 +139,11 @@ def _tensors(state: object, place: str = "") -> dict[str, Tensor]:
 def _compare(saved: Mapping[str, Tensor], present: Mapping[str, Tensor]) -> None:
     """Refuse a state of another shape before it half overwrites this one.
 
-    Saved tensors that are not yet present pass: optimisers make theirs at the first step.
+    Tensors that are absent or empty here pass: some are made at the first step, as by optimisers.
     """
     for name, tensor in present.items():
+        if tensor.numel() == 0:
+            continue
         if name not in saved:
             raise CheckpointError(f"it lacks {name}")
         if saved[name].shape != tensor.shape:

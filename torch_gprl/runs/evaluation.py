@@ -10,6 +10,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+SIDE = 320  # width and height of a film, pixels; the time to draw grows with its square
+
 
 @runtime_checkable
 class Picturesque(Protocol):
@@ -23,7 +25,7 @@ class Picturesque(Protocol):
         """Step, and start finished episodes anew."""
         ...
 
-    def render(self, learner: int, env: int) -> UInt8[Tensor, "H W 3"]:
+    def render(self, learner: int, env: int, width: int, height: int) -> UInt8[Tensor, "H W 3"]:
         """A picture of one copy."""
         ...
 
@@ -63,7 +65,7 @@ def film(
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         state = env.reset()
         for _ in range(most_frames):
-            frames.append(env.render(learner=learner, env=0))
+            frames.append(env.render(learner=learner, env=0, width=SIDE, height=SIDE))
             step, state = env.step_and_maybe_reset(policy(state))
             if step["next", "done"][learner, 0].item():
                 break

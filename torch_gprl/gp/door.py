@@ -22,7 +22,7 @@ def admit_inputs(inputs: Tensor, batch_shape: torch.Size, like: Tensor) -> Tenso
 
 def admit_data(
     inputs: Tensor, targets: Tensor, mask: Tensor | None, batch_shape: torch.Size, like: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor | None]:
     """Inputs, targets and mask for an update; entries that the mask leaves out may hold anything.
 
     Raises:
@@ -41,7 +41,7 @@ def admit_data(
     if not bool(torch.isfinite(inputs.sum() + targets.sum())):  # one synchronisation; details only on failure
         for name, tensor in (("inputs", inputs), ("targets", targets)):
             _refuse_non_finite(name, tensor)
-    return inputs, targets, torch.ones_like(targets, dtype=torch.bool) if mask is None else mask
+    return inputs, targets, mask
 
 
 def _broadcasts(shape: torch.Size, target: torch.Size) -> bool:

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torch_gprl.gp.whitened import WhitenedState
 from torch_gprl.linalg import cholesky
 
 
@@ -28,6 +29,20 @@ class BasisStatistics(NamedTuple):
     posterior_precision_diagonal: Float[Tensor, "*batch B"]
     stamps: Int[Tensor, "*batch B"]
     mask: Bool[Tensor, "*batch B"]
+
+
+def basis_statistics(state: WhitenedState, rows: int) -> BasisStatistics:
+    """Statistics of the first `rows` rows of a refreshed state, [*batch, rows] each."""
+    used = slice(rows)
+    factor = state.gram_factor[..., used, used]
+    eye = torch.eye(rows, dtype=factor.dtype, device=factor.device)
+    inverse_factor = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
+    half = torch.linalg.solve_triangular(state.precision_factor[..., used, used], inverse_factor, upper=False)
+    alpha = (inverse_factor.mT @ state.weights[..., used, None]).squeeze(-1)  # L⁻ᵀA⁻¹b
+    square = inverse_factor.square().sum(-2)
+    return BasisStatistics(
+        alpha, square, half.square().sum(-2), state.stamps[..., used], state.mask[..., used]
+    )
 
 
 class PruningScore(Protocol):

@@ -27,7 +27,7 @@ def select_novel(
     threshold: Float[Tensor, "*batch N"],
     limit: Int[Tensor, "*batch"],
 ) -> Selection:
-    """Pick points by largest novelty until none exceeds its `threshold` or `limit` have been picked.
+    """Pick points by largest novelty over threshold until none exceeds it or `limit` have been picked.
 
     Args:
         residual_gram: K(X, X) − ΦᵀΦ of the block, [*batch, N, N].
@@ -38,6 +38,34 @@ def select_novel(
     Returns:
         the picks in order, the new rows of Φ, and the novelty that is left. One host synchronisation a pick.
     """
+    pick = _pick_alone if novelty.ndim == 1 else _pick_batched
+    return pick(residual_gram, novelty, threshold, limit)
+
+
+def _pick_alone(residual_gram: Tensor, novelty: Tensor, threshold: Tensor, limit: Tensor) -> Selection:
+    """One learner: the picks are host numbers, and every step works on views. Twice as fast as a batch of 1."""
+    most = min(int(limit), novelty.shape[0])
+    excess, novelty = novelty - threshold, novelty.clone()
+    rows = residual_gram.new_empty(most, novelty.shape[0])
+    pivots: list[int] = []
+    for pick in range(most):
+        pivot = int(excess.argmax())
+        if not float(excess[pivot]) > 0:
+            break
+        row, earlier = rows[pick], rows[:pick]
+        torch.addmv(residual_gram[pivot], earlier.mT, earlier[:, pivot], alpha=-1, out=row)
+        row.mul_(row[pivot].rsqrt())
+        novelty.addcmul_(row, row, value=-1)
+        excess.addcmul_(row, row, value=-1)
+        excess[pivot] = -torch.inf
+        pivots.append(pivot)
+    accepted = torch.ones(len(pivots), dtype=torch.bool, device=novelty.device)
+    index = torch.tensor(pivots, dtype=torch.long, device=novelty.device)
+    return Selection(index, accepted, rows[: len(pivots)], novelty)
+
+
+def _pick_batched(residual_gram: Tensor, novelty: Tensor, threshold: Tensor, limit: Tensor) -> Selection:
+    """All learners in step, those that are done masked out."""
     points = novelty.shape[-1]
     rows = residual_gram.new_zeros((*novelty.shape[:-1], 0, points))
     excess = novelty - threshold
@@ -51,7 +79,7 @@ def select_novel(
         column = residual_gram.gather(-2, index.expand(*pivot.shape, 1, points))
         shared = rows.gather(-1, index.expand(*pivot.shape, pick, 1))  # the pivot's entries in earlier rows
         row = column - shared.mT @ rows
-        row = torch.where(accept[..., None, None], row / row.gather(-1, index).sqrt(), 0.0)
+        row = torch.where(accept[..., None, None], row * row.gather(-1, index).rsqrt(), 0.0)
         rows = torch.cat([rows, row], -2)
         shrink = row.squeeze(-2).square()
         novelty, excess = novelty - shrink, excess - shrink
@@ -59,6 +87,6 @@ def select_novel(
         pivots.append(pivot)
         accepts.append(accept)
     if not pivots:
-        empty = novelty.new_zeros((*novelty.shape[:-1], 0), dtype=torch.long)
-        return Selection(empty, empty.bool(), rows, novelty)
+        none = novelty.new_zeros((*novelty.shape[:-1], 0), dtype=torch.long)
+        return Selection(none, none.bool(), rows, novelty)
     return Selection(torch.stack(pivots, -1), torch.stack(accepts, -1), rows, novelty)

@@ -1,42 +1,55 @@
-"""The sparse online Gaussian process: a basis and a Gaussian pseudo-likelihood on it, kept whitened.
+"""The sparse online Gaussian process: Bayes' rule on blocks of data, with a bounded basis.
 
-The data leave behind a Gaussian term in the basis values u = f(X_B) = L w, L = chol K(X_B, X_B), and nothing
-else. With φ(x) = L⁻¹k(X_B, x), prior w ~ N(0, I) and ν(x) = k(x, x) − φᵀφ, what the basis misses of x,
-
-    A = I + Σ φφᵀ/(σ0² + ν),   b = Σ φ y/(σ0² + ν),   w | data ~ N(A⁻¹b, A⁻¹).
-
-Sums over data: a block of points is one matrix product, their order does not matter, learners merge by
-adding. Sources: Csató and Opper (2002), "Sparse on-line Gaussian processes"; the thesis' equations (.5) to
-(.13). The textbook recursion in α, C and K⁻¹, which loses its digits, is `RecursiveGP`.
-
-| paper | here | meaning |
-|---|---|---|
-| X_B | `basis` | basis vectors, rows of zeros where unused |
-| L | `gram_factor` | Cholesky factor of the basis' Gram matrix, identity rows where unused |
-| A, b | `precision`, `information` | posterior precision of w, and precision times mean |
-| γ_{n+1} (.10) | novelty | ν above |
-| σ0² | `noise_variance` | variance of the noise on targets |
+Absorbing a block adds Φ W Φᵀ to A and Φ W y to b (see `whitened`): one matrix product, whatever the order of the
+data, and learners with one basis merge by adding. Sources: Csató and Opper (2002), "Sparse on-line Gaussian
+processes"; the thesis' equations (.5) to (.13); Engel, Mannor and Meir (2005) for temporal differences. The
+textbook recursion in α, C and K⁻¹, which loses its digits, is `RecursiveGP`.
 """
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
-from torch_gprl.gp.door import admit_data, admit_inputs
-from torch_gprl.gp.posterior import Posterior
-from torch_gprl.gp.pruning import BasisStatistics, InformationScore, PruningScore, Whitened, keep_first
+from torch_gprl.gp.door import admit_data
+from torch_gprl.gp.pruning import InformationScore, PruningScore, Whitened, basis_statistics, keep_first
 from torch_gprl.gp.selection import Selection, select_novel
+from torch_gprl.gp.whitened import WhitenedState
 from torch_gprl.kernels.base import Kernel
-from torch_gprl.linalg import cholesky
+from torch_gprl.kernels.gaussian_inputs import GaussianInputs
 
 BLOCK = 256  # points absorbed at once; longer updates are cut into blocks of this size
 CHURN = 8  # a full basis admits at most one in so many points of a block: every swap projects the past
 NOVELTY_FLOOR = {torch.float64: 1e-10, torch.float32: 1e-4}  # of the prior variance: below is roundoff
 
 
-class SparseOnlineGP(nn.Module):
+class Observed(NamedTuple):
+    """A block of linear observations of f: y = f(x) − γ f(x') + noise, the second term for transitions only."""
+
+    inputs: Float[Tensor, "*batch N D"]
+    targets: Float[Tensor, "*batch N"]
+    mask: Bool[Tensor, "*batch N"] | None
+    next_inputs: GaussianInputs | None
+    discount: Float[Tensor, "*batch N"] | None
+
+    def block(self, start: int, stop: int) -> "Observed":
+        """The points from `start` to `stop`."""
+        chosen = slice(start, stop)
+        following = self.next_inputs
+        return Observed(
+            self.inputs[..., chosen, :],
+            self.targets[..., chosen],
+            None if self.mask is None else self.mask[..., chosen],
+            following
+            and GaussianInputs(
+                following.mean[..., chosen, :], following.variance[..., chosen, :], following.columns
+            ),
+            None if self.discount is None else self.discount[..., chosen],
+        )
+
+
+class SparseOnlineGP(WhitenedState):
     """Gaussian process regression on a stream, with at most a budget of basis vectors.
 
     Works as plain torch: `gp.update(inputs, targets)`, then `mean, variance = gp(inputs)`. All tensors carry
@@ -60,18 +73,6 @@ class SparseOnlineGP(nn.Module):
         ValueError: an option out of its range; the message says which and what would be valid.
     """
 
-    basis: Float[Tensor, "*batch B D"]
-    gram_factor: Float[Tensor, "*batch B B"]
-    precision: Float[Tensor, "*batch B B"]
-    information: Float[Tensor, "*batch B"]
-    size: Int[Tensor, "*batch"]
-    stamps: Int[Tensor, "*batch B"]
-    clock: Int[Tensor, ""]
-    evidence_constant: Float[Tensor, "*batch"]
-    observations: Int[Tensor, "*batch"]
-    precision_factor: Float[Tensor, "*batch B B"]
-    weights: Float[Tensor, "*batch B"]
-
     def __init__(  # the public signature of the design: each name is a word of the method
         self,
         kernel: Kernel,
@@ -85,116 +86,16 @@ class SparseOnlineGP(nn.Module):
         order: Literal["novelty", "arrival"] = "novelty",
         overshoot: int | None = None,
     ) -> None:
-        super().__init__()
         _check_options(budget, novelty_threshold, projection, order, overshoot)
-        self.kernel = kernel
+        overshoot = max(1, min(budget // 4, 64)) if overshoot is None else overshoot
+        shape = torch.Size(kernel.batch_shape if batch_shape is None else batch_shape)
+        super().__init__(kernel, budget + overshoot, noise_variance, shape)
         self.budget = budget
+        self.overshoot = overshoot
         self.novelty_threshold = novelty_threshold
         self.pruning = InformationScore() if pruning is None else pruning
         self.projection: Literal["moment", "dtc"] = projection
         self.order: Literal["novelty", "arrival"] = order
-        self.overshoot = max(1, min(budget // 4, 64)) if overshoot is None else overshoot
-        self.capacity = budget + self.overshoot
-        self.batch_shape = torch.Size(kernel.batch_shape if batch_shape is None else batch_shape)
-        like = next(kernel.parameters())
-        noise = torch.as_tensor(noise_variance, dtype=like.dtype, device=like.device).expand(self.batch_shape)
-        if not bool((torch.isfinite(noise) & (noise > 0)).all()):
-            raise ValueError(f"noise_variance must be positive and finite, got {noise_variance}")
-        self.log_noise_variance = nn.Parameter(noise.log().clone())
-        self._register_state(like)
-        self.register_load_state_dict_post_hook(lambda module, _: module._forget_factors())
-
-    def _register_state(self, like: Tensor) -> None:
-        batch, rows, dims = self.batch_shape, self.capacity, self.kernel.input_dim
-        eye = torch.eye(rows, dtype=like.dtype, device=like.device).expand(*batch, rows, rows)
-        integer = {"dtype": torch.long, "device": like.device}
-        self.register_buffer("basis", like.new_zeros(*batch, rows, dims))
-        self.register_buffer("gram_factor", eye.clone())
-        self.register_buffer("precision", eye.clone())
-        self.register_buffer("information", like.new_zeros(*batch, rows))
-        self.register_buffer("size", torch.zeros(batch, **integer))
-        self.register_buffer("stamps", torch.zeros(*batch, rows, **integer))
-        self.register_buffer("clock", torch.zeros((), **integer))
-        self.register_buffer("evidence_constant", like.new_zeros(batch))
-        self.register_buffer("observations", torch.zeros(batch, **integer))
-        # derived from the above, refreshed lazily
-        self.register_buffer("precision_factor", eye.clone(), persistent=False)
-        self.register_buffer("weights", like.new_zeros(*batch, rows), persistent=False)
-        self._stale = False
-
-    # ---------------------------------------------------------------- reading
-
-    @property
-    def noise_variance(self) -> Float[Tensor, "*batch"]:
-        """σ0² [*batch]."""
-        return self.log_noise_variance.exp()
-
-    @property
-    def mask(self) -> Bool[Tensor, "*batch B"]:
-        """Which rows of the buffers are in use, [*batch, capacity]."""
-        return torch.arange(self.capacity, device=self.size.device) < self.size.unsqueeze(-1)
-
-    @property
-    def alpha(self) -> Float[Tensor, "*batch B"]:
-        """α = L⁻ᵀA⁻¹b: the posterior mean is k(x, X_B) α; zero where unused."""
-        self.refresh()
-        return _solve(self.gram_factor.mT, self.weights.unsqueeze(-1), upper=True).squeeze(-1)
-
-    @property
-    def C(self) -> Float[Tensor, "*batch B B"]:
-        """C = L⁻ᵀ(A⁻¹ − I)L⁻¹ ⪯ 0, Csató's sign: the variance is k(x, x) + k(x, X_B) C k(X_B, x)."""
-        self.refresh()
-        inverse_factor = self._inverse_gram_factor()
-        half = _solve(self.precision_factor, inverse_factor)
-        return half.mT @ half - inverse_factor.mT @ inverse_factor
-
-    def posterior(self, inputs: Float[Tensor, "*#batch N D"]) -> Posterior:
-        """Mean and variance of f (without noise) at `inputs`, [*batch, N] each; differentiable in them."""
-        self.refresh()
-        inputs = admit_inputs(inputs, self.batch_shape, self.basis)
-        phi = self._features(inputs)
-        mean = (phi * self.weights.unsqueeze(-1)).sum(-2)
-        explained, left = phi.square().sum(-2), _solve(self.precision_factor, phi).square().sum(-2)
-        return Posterior(mean, self.kernel.diag(inputs) - explained + left)  # k** − φᵀφ + φᵀA⁻¹φ
-
-    def mean(self, inputs: Float[Tensor, "*#batch N D"]) -> Float[Tensor, "*batch N"]:
-        """Posterior mean alone [*batch, N], several times cheaper than `posterior`."""
-        inputs = admit_inputs(inputs, self.batch_shape, self.basis)
-        return (self.kernel(inputs, self.basis) @ self.alpha.unsqueeze(-1)).squeeze(-1)
-
-    def forward(
-        self, inputs: Float[Tensor, "*#batch N D"]
-    ) -> tuple[Float[Tensor, "*batch N"], Float[Tensor, "*batch N"]]:
-        """(mean, variance) of f at `inputs`, each [*batch, N]."""
-        posterior = self.posterior(inputs)
-        return posterior.mean, posterior.variance
-
-    def joint(self, inputs: Float[Tensor, "*#batch N D"]) -> torch.distributions.MultivariateNormal:
-        """Joint posterior of f at `inputs`, for sampling whole functions."""
-        self.refresh()
-        inputs = admit_inputs(inputs, self.batch_shape, self.basis)
-        phi = self._features(inputs)
-        half = _solve(self.precision_factor, phi)
-        covariance = self.kernel(inputs, inputs) - phi.mT @ phi + half.mT @ half
-        mean = (phi * self.weights.unsqueeze(-1)).sum(-2)
-        return torch.distributions.MultivariateNormal(
-            mean, scale_tril=cholesky(covariance), validate_args=False
-        )
-
-    def log_marginal_likelihood(self) -> Float[Tensor, "*batch"]:
-        """Log p(targets) of the streaming model [*batch]: −½ log|A| + ½ bᵀA⁻¹b plus the data's own constant.
-
-        Exact for the dense GP when nothing was projected, the FITC evidence on a fixed basis. Differentiable
-        in the kernel's parameters, with the pseudo-likelihood of the basis held fixed.
-        """
-        gram_factor = cholesky(self._gram())
-        precision, information = self._whiten(gram_factor)
-        factor = cholesky(precision)
-        half = _solve(factor, information.unsqueeze(-1))
-        log_determinant = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        return self.evidence_constant + 0.5 * (half.square().sum((-2, -1)) - log_determinant)
-
-    # ---------------------------------------------------------------- learning
 
     @torch.no_grad()
     def update(
@@ -203,87 +104,147 @@ class SparseOnlineGP(nn.Module):
         targets: Float[Tensor, "*#batch N"],
         stamp: int | None = None,
         mask: Bool[Tensor, "*#batch N"] | None = None,
+        *,
+        next_inputs: Float[Tensor, "*#batch N D"] | GaussianInputs | None = None,
+        discount: float | Float[Tensor, "*#batch N"] = 1.0,
     ) -> None:
         """Bayes' rule on a block of data: grow the basis, absorb every point, prune to the budget.
 
+        With `next_inputs` each target is a temporal difference, y = f(x) − γ f(x') + noise: with rewards as
+        targets this is GPTD. A `GaussianInputs` averages f(x') over its Gaussian columns, in closed form.
+
         Args:
             inputs: [*batch, N, D].
-            targets: noisy values of f [*batch, N].
+            targets: noisy values of f, or of the difference, [*batch, N].
             stamp: sets the clock, the time stamp of basis vectors added from now on.
             mask: which points count, [*batch, N]; the others leave no trace. All unless told.
+            next_inputs: x', [*batch, N, D]; none for plain regression.
+            discount: γ, a number or [*batch, N]: 0 where x is the last point before a terminal state.
 
         Raises:
             ValueError: wrong shapes, NaN or infinite data; nothing was changed then.
         """
         inputs, targets, mask = admit_data(inputs, targets, mask, self.batch_shape, self.basis)
+        observed = self._observed(inputs, targets, mask, next_inputs, discount)
         if stamp is not None:
             self.clock.fill_(stamp)
+        if self._kernel_versions() != self._kernel_seen:
+            self.rebase()
         block = 1 if self.order == "arrival" else BLOCK
         for start in range(0, inputs.shape[-2], block):
-            stop = start + block
-            self._absorb_block(inputs[..., start:stop, :], targets[..., start:stop], mask[..., start:stop])
+            self._absorb_block(observed.block(start, start + block))
 
-    def _absorb_block(self, inputs: Tensor, targets: Tensor, mask: Tensor) -> None:
+    def _observed(
+        self,
+        inputs: Tensor,
+        targets: Tensor,
+        mask: Tensor | None,
+        next_inputs: Tensor | GaussianInputs | None,
+        discount: float | Tensor,
+    ) -> Observed:
+        if next_inputs is None:
+            return Observed(inputs, targets, mask, None, None)
+        if not isinstance(next_inputs, GaussianInputs):
+            next_inputs = GaussianInputs.exactly(next_inputs)
+        rate = torch.as_tensor(discount, dtype=targets.dtype, device=targets.device)
+        # a point that does not count, or has no successor, may hold anything there
+        rate = rate.expand(targets.shape)
+        counts = rate != 0 if mask is None else mask & (rate != 0)
+        mean, rate, _ = admit_data(next_inputs.mean, rate, counts, self.batch_shape, self.basis)
+        variance = next_inputs.variance.to(mean.dtype).expand(*mean.shape[:-1], -1)
+        return Observed(inputs, targets, mask, GaussianInputs(mean, variance, next_inputs.columns), rate)
+
+    def _absorb_block(self, block: Observed) -> None:
+        inputs, mask = block.inputs, block.mask
         noise = self.noise_variance.unsqueeze(-1)
-        phi = self._features(inputs)
-        prior = self.kernel.diag(inputs)
-        novelty = prior - phi.square().sum(-2)
-        floor = NOVELTY_FLOOR[prior.dtype] * prior
-        threshold = torch.maximum((self.novelty_threshold * noise).expand_as(prior), floor)
-        limit = self._additions_allowed(inputs.shape[-2])
-        if bool(((novelty > threshold) & mask & (limit > 0).unsqueeze(-1)).any()):
-            residual = self.kernel(inputs, inputs) - phi.mT @ phi
-            selection = select_novel(residual, torch.where(mask, novelty, -torch.inf), threshold, limit)
-            novelty = torch.where(mask, selection.novelty, novelty)
-            phi = self._add(selection, inputs, phi)
-        # moment: 1/(σ0² + ν); dtc ignores what the basis misses
+        phi, novelty = self._grow(inputs, mask, noise)
+        if block.next_inputs is not None and block.discount is not None:
+            phi, novelty = self._difference(phi, block.inputs, block.next_inputs, block.discount)
+        # moment: W = 1/(σ0² + ν); dtc ignores what the basis misses
         variance = noise + novelty if self.projection == "moment" else noise.expand_as(novelty)
-        weight = torch.where(mask, 1 / variance, 0.0)
+        weight = variance.reciprocal() if mask is None else torch.where(mask, 1 / variance, 0.0)
+        rows = phi.shape[-2]
         scaled = phi * weight.sqrt().unsqueeze(-2)
-        self.precision.add_(scaled @ scaled.mT)
-        self.information.add_((phi * (weight * targets).unsqueeze(-2)).sum(-1))
-        data_fit = weight * targets.square() - torch.where(mask, (weight / (2 * torch.pi)).log(), 0.0)
-        self.evidence_constant.sub_(0.5 * data_fit.sum(-1))
-        self.observations.add_(mask.sum(-1))
+        weighted = weight * block.targets
+        self.precision[..., :rows, :rows].add_(scaled @ scaled.mT)
+        self.information[..., :rows].add_((phi @ weighted.unsqueeze(-1)).squeeze(-1))
+        log_weight = (weight / TWO_PI).log()
+        log_weight = log_weight if mask is None else log_weight.where(mask, 0.0)
+        self.evidence_constant.sub_(0.5 * (torch.linalg.vecdot(weighted, block.targets) - log_weight.sum(-1)))
+        self.observations.add_(inputs.shape[-2] if mask is None else mask.sum(-1))
         self._stale = True
-        if bool((self.size > self.capacity - min(self.overshoot, _churn(inputs.shape[-2]))).any()):
+        if self._active().rows > self.capacity - min(self.overshoot, _churn(inputs.shape[-2])):
             self._prune()
 
-    def _additions_allowed(self, points: int) -> Int[Tensor, "*batch"]:
-        """Free growth up to the budget, then `_churn` per block, never past the buffers."""
-        wanted = (self.budget - self.size).clamp_min(0) + _churn(points)
-        return torch.minimum(wanted, self.capacity - self.size)
+    def _grow(self, inputs: Tensor, mask: Tensor | None, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Add the novel points of a block to the basis; φ and novelty of all of them, on the new basis."""
+        phi = self._features(inputs)
+        prior = self.kernel.diag(inputs)
+        novelty = prior - torch.linalg.vecdot(phi, phi, dim=-2)
+        threshold = torch.maximum(self.novelty_threshold * noise, NOVELTY_FLOOR[prior.dtype] * prior)
+        candidate = novelty > threshold if mask is None else (novelty > threshold) & mask
+        if not bool(candidate.any()):
+            return phi, novelty
+        # free growth up to the budget, then the churn, never past the buffers
+        wanted = (self.budget - self.size).clamp_min(0) + _churn(inputs.shape[-2])
+        limit = torch.minimum(wanted, self.capacity - self.size)
+        residual = self.kernel(inputs, inputs) - phi.mT @ phi
+        open_to = novelty if mask is None else novelty.where(mask, -torch.inf)
+        selection = select_novel(residual, open_to, threshold, limit)
+        left = selection.novelty if mask is None else torch.where(mask, selection.novelty, novelty)
+        return self._add(selection, inputs, phi), left
 
     def _add(self, selection: Selection, inputs: Tensor, phi: Tensor) -> Tensor:
         """Write the selected points behind the basis in use; returns Φ with its new rows."""
-        slots = self.size.unsqueeze(-1) + torch.arange(selection.pivots.shape[-1], device=self.size.device)
-        rows = torch.arange(self.capacity, device=self.size.device)
-        place = (rows.unsqueeze(-1) == slots.unsqueeze(-2)) & selection.accepted.unsqueeze(-2)  # [*b, B, J]
+        picks, before = selection.pivots.shape[-1], phi.shape[-2]
+        if not picks:
+            return phi
+        rows = torch.arange(min(before + picks, self.capacity), device=phi.device)
+        slots = self.size.unsqueeze(-1) + torch.arange(picks, device=phi.device)
+        place = (rows.unsqueeze(-1) == slots.unsqueeze(-2)) & selection.accepted.unsqueeze(-2)  # [*b, R, J]
         one_hot = place.to(phi.dtype)
+        phi = torch.cat([phi, phi.new_zeros(*phi.shape[:-2], len(rows) - before, phi.shape[-1])], -2)
         phi = phi + one_hot @ selection.rows
-        index = selection.pivots.unsqueeze(-2).expand(*selection.pivots.shape[:-1], self.capacity, -1)
-        new_rows = phi.gather(-1, index).mT  # row j of the new part of L is φ of its own point
-        below = rows <= slots.unsqueeze(-1)  # and ends at the diagonal
-        self.gram_factor.add_(one_hot @ (new_rows * below - one_hot.mT))
-        chosen = inputs.gather(
-            -2, selection.pivots.unsqueeze(-1).expand(*selection.pivots.shape, inputs.shape[-1])
-        )
-        self.basis.add_(one_hot @ chosen)
-        self.stamps.copy_(torch.where(place.any(-1), self.clock, self.stamps))
+        index = selection.pivots.unsqueeze(-2).expand(*selection.pivots.shape[:-1], len(rows), picks)
+        below = rows.unsqueeze(-1) <= slots.unsqueeze(-2)
+        # row j of the new part of L is φ of its own point, up to the diagonal; it replaces an identity row
+        columns = phi.gather(-1, index) * below - one_hot
+        used = slice(len(rows))
+        self.gram_factor[..., used, used].add_(one_hot @ columns.mT)
+        wide = selection.pivots.unsqueeze(-1).expand(*selection.pivots.shape, inputs.shape[-1])
+        self.basis[..., used, :].add_(one_hot @ inputs.gather(-2, wide))
+        self.stamps[..., used].copy_(torch.where(place.any(-1), self.clock, self.stamps[..., used]))
         self.size.add_(selection.accepted.sum(-1))
         return phi
 
+    def _difference(
+        self, phi: Tensor, inputs: Tensor, following: GaussianInputs, discount: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """φ and novelty of f(x) − γ f(x'), from φ of x."""
+        active, kernel = self._active(), self.kernel
+        next_phi = self._whitened(kernel.expected(following, active.basis).mT, active)
+        difference = phi - discount.unsqueeze(-2) * next_phi
+        shared = kernel.expected(following, inputs).diagonal(dim1=-2, dim2=-1)
+        own = kernel.expected(following, following).diagonal(dim1=-2, dim2=-1)
+        # Var[f(x) − γ f(x')] = k(x, x) − 2γ k(x, x') + γ² k(x', x')
+        prior = kernel.diag(inputs) - 2 * discount * shared + discount.square() * own
+        return difference, prior - torch.linalg.vecdot(difference, difference, dim=-2)
+
     def _prune(self) -> None:
         """Delete the lowest scores until every learner is back at its budget."""
-        score = self.pruning(self.basis_statistics()).masked_fill(~self.mask, -torch.inf)
+        self.refresh()
+        rows, kept = self._active().rows, slice(self.budget)
+        score = self.pruning(basis_statistics(self, rows)).masked_fill(~self.mask[..., :rows], -torch.inf)
         ranked = score.argsort(dim=-1, descending=True)
-        order = torch.cat([ranked[..., : self.budget].sort(-1).values, ranked[..., self.budget :]], -1)
-        state = Whitened(self.gram_factor, self.precision, self.information)
+        order = torch.cat([ranked[..., kept].sort(-1).values, ranked[..., self.budget :]], -1)
+        used = slice(rows)
+        state = Whitened(
+            self.gram_factor[..., used, used], self.precision[..., used, used], self.information[..., used]
+        )
         left, evidence = keep_first(state, order, self.budget, self.projection)
-        basis = self.basis.gather(-2, order.unsqueeze(-1).expand_as(self.basis))[..., : self.budget, :]
-        stamps = self.stamps.gather(-1, order)[..., : self.budget]
+        wide = order[..., kept].unsqueeze(-1).expand(*order.shape[:-1], self.budget, self.basis.shape[-1])
+        basis, stamps = self.basis.gather(-2, wide), self.stamps.gather(-1, order[..., kept])
         self._clear()
-        kept = slice(self.budget)
         self.basis[..., kept, :] = basis
         self.stamps[..., kept] = stamps
         self.gram_factor[..., kept, kept] = left.gram_factor
@@ -292,16 +253,6 @@ class SparseOnlineGP(nn.Module):
         self.evidence_constant.add_(evidence)
         self.size.clamp_(max=self.budget)
         self._stale = True
-
-    def basis_statistics(self) -> BasisStatistics:
-        """What a pruning score sees of each basis vector, [*batch, capacity] each."""
-        self.refresh()
-        inverse_factor = self._inverse_gram_factor()
-        half = _solve(self.precision_factor, inverse_factor)
-        alpha = (inverse_factor * self.weights.unsqueeze(-1)).sum(-2)
-        return BasisStatistics(
-            alpha, inverse_factor.square().sum(-2), half.square().sum(-2), self.stamps, self.mask
-        )
 
     @torch.no_grad()
     def merge(self, other: "SparseOnlineGP") -> None:
@@ -324,60 +275,12 @@ class SparseOnlineGP(nn.Module):
         self._stale = True
 
     @torch.no_grad()
-    def rebase(self) -> None:
-        """Take over the kernel's present parameters: call after changing them.
-
-        The pseudo-likelihood of the basis values stays; prior, factors and posterior follow the new kernel.
-        """
-        gram_factor = cholesky(self._gram())
-        precision, information = self._whiten(gram_factor)
-        self.gram_factor.copy_(gram_factor)
-        self.precision.copy_(precision)
-        self.information.copy_(information)
-        self._stale = True
-
-    @torch.no_grad()
     def reset(self) -> None:
         """Forget all data and the basis; the kernel's parameters and the noise stay."""
         self._clear()
-        self.size.zero_()
-        self.clock.zero_()
-        self.observations.zero_()
-        self.evidence_constant.zero_()
-        self._stale = True
-
-    @torch.no_grad()
-    def refresh(self) -> None:
-        """Bring the derived factors up to date with the state; does nothing when they are."""
-        if self._stale:
-            self.precision_factor.copy_(cholesky(self.precision))
-            self.weights.copy_(
-                torch.cholesky_solve(self.information.unsqueeze(-1), self.precision_factor).squeeze(-1)
-            )
-            self._stale = False
-
-    # ---------------------------------------------------------------- inside
-
-    def _features(self, inputs: Tensor) -> Float[Tensor, "*batch B N"]:
-        """φ = L⁻¹ k(X_B, x) in columns, zero in unused rows."""
-        return _solve(self.gram_factor, self.kernel(self.basis, inputs) * self.mask.unsqueeze(-1))
-
-    def _gram(self) -> Float[Tensor, "*batch B B"]:
-        """K(X_B, X_B) with identity rows where unused, under the kernel's present parameters."""
-        used = self.mask.unsqueeze(-1) & self.mask.unsqueeze(-2)
-        eye = torch.eye(self.capacity, dtype=self.basis.dtype, device=self.basis.device)
-        return torch.where(used, self.kernel(self.basis, self.basis), eye)
-
-    def _whiten(self, gram_factor: Tensor) -> tuple[Tensor, Tensor]:
-        """(A, b) of the same pseudo-likelihood in the coordinates of another Gram factor L' = L G."""
-        change = _solve(self.gram_factor, gram_factor)  # G
-        eye = torch.eye(self.capacity, dtype=self.basis.dtype, device=self.basis.device)
-        precision = eye + change.mT @ (self.precision - eye) @ change  # I + L'ᵀΛL'
-        return precision, (change * self.information.unsqueeze(-1)).sum(-2)  # L'ᵀh
-
-    def _inverse_gram_factor(self) -> Float[Tensor, "*batch B B"]:
-        eye = torch.eye(self.capacity, dtype=self.basis.dtype, device=self.basis.device)
-        return _solve(self.gram_factor, eye.expand_as(self.gram_factor))
+        for counter in (self.size, self.clock, self.observations, self.evidence_constant):
+            counter.zero_()
+        self._accept_state()
 
     def _clear(self) -> None:
         for matrix in (self.gram_factor, self.precision):
@@ -386,12 +289,8 @@ class SparseOnlineGP(nn.Module):
         for other in (self.basis, self.information, self.stamps):
             other.zero_()
 
-    def _forget_factors(self) -> None:
-        self._stale = True
 
-
-def _solve(factor: Tensor, right: Tensor, upper: bool = False) -> Tensor:
-    return torch.linalg.solve_triangular(factor, right, upper=upper)
+TWO_PI = 2 * torch.pi
 
 
 def _churn(points: int) -> int:

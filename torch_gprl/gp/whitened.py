@@ -1,0 +1,273 @@
+"""The state of a sparse Gaussian process, and everything that can be read from it.
+
+The data leave behind a Gaussian term in the basis values u = f(X_B) = L w, L = chol K(X_B, X_B), and nothing
+else. With φ(x) = L⁻¹k(X_B, x), prior w ~ N(0, I) and ν(x) = k(x, x) − φᵀφ, what the basis misses of x,
+
+    A = I + Σ φφᵀ/(σ0² + ν),   b = Σ φ y/(σ0² + ν),   w | data ~ N(A⁻¹b, A⁻¹).
+
+Buffers have a fixed number of rows, with a count per learner: state_dict, weight sync to workers and batching
+never see a shape change. What is derived from them is remembered and renewed when they, or the kernel's
+parameters, have changed.
+
+| paper | here | meaning |
+|---|---|---|
+| X_B | `basis` | basis vectors, rows of zeros where unused |
+| L | `gram_factor` | Cholesky factor of the basis' Gram matrix, identity rows where unused |
+| A, b | `precision`, `information` | posterior precision of w, and precision times mean |
+| σ0² | `noise_variance` | variance of the noise on targets |
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from torch_gprl.gp.door import admit_inputs
+from torch_gprl.gp.posterior import Posterior
+from torch_gprl.kernels.base import Kernel
+from torch_gprl.linalg import cholesky
+
+
+class Active(NamedTuple):
+    """The rows in use, up to those of the largest basis among the learners, as contiguous tensors."""
+
+    rows: int
+    basis: Float[Tensor, "*batch R D"]
+    gram_factor: Float[Tensor, "*batch R R"]
+    mask: Bool[Tensor, "*batch R 1"] | None  # which of them are a learner's own; None if all are
+
+
+class WhitenedState(nn.Module):
+    """Basis, pseudo-likelihood, prior, and the posterior that they make.
+
+    Args:
+        kernel: covariance function.
+        capacity: rows of the buffers.
+        noise_variance: σ0², a number or [*batch].
+        batch_shape: leading dimensions of everything.
+
+    Raises:
+        ValueError: a noise variance that is not positive and finite.
+    """
+
+    basis: Float[Tensor, "*batch B D"]
+    gram_factor: Float[Tensor, "*batch B B"]
+    precision: Float[Tensor, "*batch B B"]
+    information: Float[Tensor, "*batch B"]
+    size: Int[Tensor, "*batch"]
+    stamps: Int[Tensor, "*batch B"]
+    clock: Int[Tensor, ""]
+    evidence_constant: Float[Tensor, "*batch"]
+    observations: Int[Tensor, "*batch"]
+    precision_factor: Float[Tensor, "*batch B B"]
+    weights: Float[Tensor, "*batch B"]
+
+    def __init__(
+        self, kernel: Kernel, capacity: int, noise_variance: float | Tensor, batch_shape: torch.Size
+    ) -> None:
+        super().__init__()
+        self.kernel = kernel
+        self.capacity = capacity
+        self.batch_shape = batch_shape
+        like = next(kernel.parameters())
+        noise = torch.as_tensor(noise_variance, dtype=like.dtype, device=like.device).expand(batch_shape)
+        if not bool((torch.isfinite(noise) & (noise > 0)).all()):
+            raise ValueError(f"noise_variance must be positive and finite, got {noise_variance}")
+        self.log_noise_variance = nn.Parameter(noise.log().clone())
+        self._register_state(like)
+        self.register_load_state_dict_post_hook(_after_load)
+        self._accept_state()
+
+    def _register_state(self, like: Tensor) -> None:
+        batch, rows, dims = self.batch_shape, self.capacity, self.kernel.input_dim
+        eye = torch.eye(rows, dtype=like.dtype, device=like.device).expand(*batch, rows, rows)
+        integer = {"dtype": torch.long, "device": like.device}
+        self.register_buffer("basis", like.new_zeros(*batch, rows, dims))
+        self.register_buffer("gram_factor", eye.clone())
+        self.register_buffer("precision", eye.clone())
+        self.register_buffer("information", like.new_zeros(*batch, rows))
+        self.register_buffer("size", torch.zeros(batch, **integer))
+        self.register_buffer("stamps", torch.zeros(*batch, rows, **integer))
+        self.register_buffer("clock", torch.zeros((), **integer))
+        self.register_buffer("evidence_constant", like.new_zeros(batch))
+        self.register_buffer("observations", torch.zeros(batch, **integer))
+        # derived from the above, see `refresh`
+        self.register_buffer("precision_factor", eye.clone(), persistent=False)
+        self.register_buffer("weights", like.new_zeros(*batch, rows), persistent=False)
+
+    # ---------------------------------------------------------------- reading
+
+    @property
+    def noise_variance(self) -> Float[Tensor, "*batch"]:
+        """σ0² [*batch]."""
+        return self.log_noise_variance.exp()
+
+    @property
+    def mask(self) -> Bool[Tensor, "*batch B"]:
+        """Which rows of the buffers are in use, [*batch, capacity]."""
+        return torch.arange(self.capacity, device=self.size.device) < self.size.unsqueeze(-1)
+
+    @property
+    def alpha(self) -> Float[Tensor, "*batch B"]:
+        """α = L⁻ᵀA⁻¹b: the posterior mean is k(x, X_B) α; zero where unused."""
+        self.refresh()
+        return _solve(self.gram_factor.mT, self.weights.unsqueeze(-1), upper=True).squeeze(-1)
+
+    @property
+    def C(self) -> Float[Tensor, "*batch B B"]:
+        """C = L⁻ᵀ(A⁻¹ − I)L⁻¹ ⪯ 0, Csató's sign: the variance is k(x, x) + k(x, X_B) C k(X_B, x)."""
+        self.refresh()
+        eye = torch.eye(self.capacity, dtype=self.basis.dtype, device=self.basis.device)
+        inverse_factor = _solve(self.gram_factor, eye.expand_as(self.gram_factor))
+        half = _solve(self.precision_factor, inverse_factor)
+        return half.mT @ half - inverse_factor.mT @ inverse_factor
+
+    def posterior(self, inputs: Float[Tensor, "*#batch N D"]) -> Posterior:
+        """Mean and variance of f (without noise) at `inputs`, [*batch, N] each; differentiable in them."""
+        self.refresh()
+        inputs = admit_inputs(inputs, self.batch_shape, self.basis)
+        phi, half = self._project(inputs)
+        mean = (self.weights[..., None, : phi.shape[-2]] @ phi).squeeze(-2)
+        # k** − φᵀφ + φᵀA⁻¹φ
+        return Posterior(mean, self.kernel.diag(inputs) - _square(phi) + _square(half))
+
+    def mean(self, inputs: Float[Tensor, "*#batch N D"]) -> Float[Tensor, "*batch N"]:
+        """Posterior mean alone [*batch, N], several times cheaper than `posterior`."""
+        inputs = admit_inputs(inputs, self.batch_shape, self.basis)
+        alpha, active = self.alpha, self._active()
+        return (self.kernel(inputs, active.basis) @ alpha[..., : active.rows, None]).squeeze(-1)
+
+    def forward(
+        self, inputs: Float[Tensor, "*#batch N D"]
+    ) -> tuple[Float[Tensor, "*batch N"], Float[Tensor, "*batch N"]]:
+        """(mean, variance) of f at `inputs`, each [*batch, N]."""
+        posterior = self.posterior(inputs)
+        return posterior.mean, posterior.variance
+
+    def joint(self, inputs: Float[Tensor, "*#batch N D"]) -> torch.distributions.MultivariateNormal:
+        """Joint posterior of f at `inputs`, for sampling whole functions."""
+        self.refresh()
+        inputs = admit_inputs(inputs, self.batch_shape, self.basis)
+        phi, half = self._project(inputs)
+        covariance = self.kernel(inputs, inputs) - phi.mT @ phi + half.mT @ half
+        mean = (self.weights[..., None, : phi.shape[-2]] @ phi).squeeze(-2)
+        factor = cholesky(covariance)
+        return torch.distributions.MultivariateNormal(mean, scale_tril=factor, validate_args=False)
+
+    def log_marginal_likelihood(self) -> Float[Tensor, "*batch"]:
+        """Log p(targets) of the streaming model [*batch]: −½ log|A| + ½ bᵀA⁻¹b plus the data's own constant.
+
+        Exact for the dense GP when nothing was projected, the FITC evidence on a fixed basis. Differentiable
+        in the kernel's parameters, with the pseudo-likelihood of the basis held fixed.
+        """
+        precision, information = self._whiten(cholesky(self._gram()))
+        factor = cholesky(precision)
+        half = _solve(factor, information.unsqueeze(-1))
+        log_determinant = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        return self.evidence_constant + 0.5 * (half.square().sum((-2, -1)) - log_determinant)
+
+    # ---------------------------------------------------------------- keeping derived things fresh
+
+    @torch.no_grad()
+    def refresh(self) -> None:
+        """Bring what is derived up to date with state and kernel; does nothing when it is.
+
+        Changes are seen by the version counters of the tensors, so weight sync and optimisers need not tell.
+        A compiled caller sees the changes that went through this object's own methods.
+        """
+        compiling = torch.compiler.is_compiling()
+        if not compiling and self._kernel_versions() != self._kernel_seen:
+            self.rebase()
+        if self._stale or not (compiling or self._state_versions() == self._state_seen):
+            self.precision_factor.copy_(cholesky(self.precision))
+            solution = torch.cholesky_solve(self.information.unsqueeze(-1), self.precision_factor)
+            self.weights.copy_(solution.squeeze(-1))
+            self._stale = False
+            if not compiling:
+                self._state_seen = self._state_versions()
+
+    @torch.no_grad()
+    def rebase(self) -> None:
+        """Take over the kernel's present parameters; reading and learning do so by themselves.
+
+        The pseudo-likelihood of the basis values stays; prior, factors and posterior follow the new kernel.
+        """
+        gram_factor = cholesky(self._gram())
+        precision, information = self._whiten(gram_factor)
+        self.gram_factor.copy_(gram_factor)
+        self.precision.copy_(precision)
+        self.information.copy_(information)
+        self._accept_state()
+
+    def _accept_state(self) -> None:
+        """The state was just made for the present kernel; everything derived from it is out of date."""
+        self._stale = True
+        self._kernel_parameters = list(self.kernel.parameters())
+        self._kernel_seen = self._kernel_versions()
+        self._state_seen: tuple[int, ...] = ()
+        self._active_seen: tuple[int, ...] = ()
+
+    def _kernel_versions(self) -> tuple[int, ...]:
+        return tuple(parameter._version for parameter in self._kernel_parameters)
+
+    def _state_versions(self) -> tuple[int, ...]:
+        return self.precision._version, self.information._version, id(self.precision)
+
+    def _active(self) -> Active:
+        """The rows in use. On a GPU all rows: asking how many are used would wait for the device."""
+        if torch.compiler.is_compiling() or self.size.device.type != "cpu":
+            return Active(self.capacity, self.basis, self.gram_factor, self.mask.unsqueeze(-1))
+        seen = self.basis._version, self.gram_factor._version, id(self.basis)
+        if seen != self._active_seen:
+            sizes = self.size.flatten().tolist()
+            rows = max(sizes, default=0)
+            mask = None if min(sizes, default=0) == rows else self.mask[..., :rows].unsqueeze(-1)
+            factor = self.gram_factor[..., :rows, :rows].contiguous()
+            self._active_rows = Active(rows, self.basis[..., :rows, :].contiguous(), factor, mask)
+            self._active_seen = seen
+        return self._active_rows
+
+    # ---------------------------------------------------------------- inside
+
+    def _features(self, inputs: Tensor) -> Float[Tensor, "*batch R N"]:
+        """φ = L⁻¹ k(X_B, x) in columns, for the rows in use."""
+        active = self._active()
+        return self._whitened(self.kernel(active.basis, inputs), active)
+
+    def _whitened(self, cross: Tensor, active: Active) -> Tensor:
+        return _solve(active.gram_factor, cross if active.mask is None else cross * active.mask)
+
+    def _project(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """φ and R⁻¹φ with A = RRᵀ: what the basis explains of x, and what the data left open of that."""
+        phi = self._features(inputs)
+        rows = phi.shape[-2]
+        return phi, _solve(self.precision_factor[..., :rows, :rows], phi)
+
+    def _gram(self) -> Float[Tensor, "*batch B B"]:
+        """K(X_B, X_B) with identity rows where unused, under the kernel's present parameters."""
+        used = self.mask.unsqueeze(-1) & self.mask.unsqueeze(-2)
+        eye = torch.eye(self.capacity, dtype=self.basis.dtype, device=self.basis.device)
+        return torch.where(used, self.kernel(self.basis, self.basis), eye)
+
+    def _whiten(self, gram_factor: Tensor) -> tuple[Tensor, Tensor]:
+        """(A, b) of the same pseudo-likelihood in the coordinates of another Gram factor L' = L G."""
+        change = _solve(self.gram_factor, gram_factor)  # G
+        eye = torch.eye(self.capacity, dtype=self.basis.dtype, device=self.basis.device)
+        precision = eye + change.mT @ (self.precision - eye) @ change  # I + L'ᵀΛL'
+        return precision, (change * self.information.unsqueeze(-1)).sum(-2)  # L'ᵀh
+
+
+def _after_load(module: nn.Module, keys: object) -> None:
+    """A loaded state brings its own kernel parameters along."""
+    assert isinstance(module, WhitenedState)
+    module._accept_state()
+
+
+def _solve(factor: Tensor, right: Tensor, upper: bool = False) -> Tensor:
+    return torch.linalg.solve_triangular(factor, right, upper=upper)
+
+
+def _square(columns: Tensor) -> Tensor:
+    """Squared norm of each column [*batch, N]."""
+    return torch.linalg.vecdot(columns, columns, dim=-2)

@@ -54,7 +54,7 @@ def cholesky(matrix: SquareMatrix, max_jitter: float | None = None) -> SquareMat
 
 def _succeeded(factor: Tensor, info: Tensor) -> bool:
     # `info` may let NaN and infinity pass; they end in the pivots, and neither is less than infinity
-    pivots = factor.detach().diagonal(dim1=-2, dim2=-1)
+    pivots = factor.diagonal(dim1=-2, dim2=-1)
     return bool((pivots.sum() < torch.inf) & ~info.any())
 
 

@@ -1,5 +1,7 @@
 """Figures: what is drawn is what was given, and the labels say what it is."""
 
+import dataclasses
+
 import matplotlib.image
 import numpy as np
 import pytest
@@ -78,6 +80,19 @@ def test_a_surface_shows_value_and_uncertainty_over_the_plane():
         assert axes.get_xlim() == (-3, 3)
         assert axes.get_ylim() == (-1, 1)
     assert figure.axes[0].get_ylabel() == "b"
+
+
+@pytest.mark.parametrize(
+    ("places", "note"),
+    [
+        ([[0.5, 0.2], [3.0, -1.0]], "○ 2 basis vectors"),
+        ([[0.5, 0.2], [3.1, 0.0], [0.0, -1.1]], "○ 1 basis vectors, 2 more outside the picture"),
+        ([], "○ 0 basis vectors"),
+    ],
+)
+def test_a_surface_counts_its_basis_vectors(places, note):
+    surface = dataclasses.replace(a_surface(), basis=np.array(places, dtype=float).reshape(-1, 2))
+    assert value_surface(surface).get_supxlabel() == note
 
 
 @pytest.mark.parametrize("ending", ["png", "pdf"])

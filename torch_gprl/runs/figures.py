@@ -107,8 +107,16 @@ def value_surface(surface: Surface, title: str = "") -> Figure:
         axes.set(xlim=surface.x[[0, -1]], ylim=surface.y[[0, -1]])
         axes.title.set_size("medium")
     left.set_ylabel(surface.labels[1])
-    figure.supxlabel(f"○ {len(surface.basis)} basis vectors", fontsize="small", color="0.3")
+    figure.supxlabel(_basis_note(surface), fontsize="small", color="0.3")
     return figure
+
+
+def _basis_note(surface: Surface) -> str:
+    """How many basis vectors there are, and how many of them the picture shows."""
+    corners = np.array([[surface.x[0], surface.y[0]], [surface.x[-1], surface.y[-1]]])
+    shown = int(((surface.basis >= corners[0]) & (surface.basis <= corners[1])).all(axis=1).sum())
+    outside = len(surface.basis) - shown
+    return f"○ {shown} basis vectors" + (f", {outside} more outside the picture" if outside else "")
 
 
 def save_figure(figure: Figure, path: Path) -> None:

@@ -11,7 +11,7 @@ deletion in whitened coordinates, where the basis values are u = L w and the pos
 | Q_ii + C_ii | `posterior_precision_diagonal` | diagonal of L⁻ᵀA⁻¹L⁻¹ |
 """
 
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -45,6 +45,7 @@ def basis_statistics(state: WhitenedState, rows: int) -> BasisStatistics:
     )
 
 
+@runtime_checkable
 class PruningScore(Protocol):
     """Maps statistics of the basis to a score per basis vector; the smallest scores are deleted."""
 

@@ -6,6 +6,7 @@ processes"; the thesis' equations (.5) to (.13); Engel, Mannor and Meir (2005) f
 textbook recursion in α, C and K⁻¹, which loses its digits, is `RecursiveGP`.
 """
 
+import math
 from typing import Literal, NamedTuple
 
 import torch
@@ -20,7 +21,9 @@ from torch_gprl.kernels.base import Kernel
 from torch_gprl.kernels.gaussian_inputs import GaussianInputs
 
 BLOCK = 256  # points absorbed at once; longer updates are cut into blocks of this size
-CHURN = 8  # a full basis admits at most one in so many points of a block: every swap projects the past
+# A full basis admits at most one in so many points of a block: every swap projects the past. Of 4, 8, 16, 32 and
+# 64, on streams of 12,800 points, 32 predicted best or within 2 % of it, and 4 worst.
+CHURN = 32
 NOVELTY_FLOOR = {torch.float64: 1e-10, torch.float32: 1e-4}  # of the prior variance: below is roundoff
 
 
@@ -131,8 +134,9 @@ class SparseOnlineGP(WhitenedState):
         if self._kernel_versions() != self._kernel_seen:
             self.rebase()
         block = 1 if self.order == "arrival" else BLOCK
+        noise = self.noise_variance.unsqueeze(-1)
         for start in range(0, inputs.shape[-2], block):
-            self._absorb_block(observed.block(start, start + block))
+            self._absorb_block(observed.block(start, start + block), noise)
 
     def _observed(
         self,
@@ -154,27 +158,34 @@ class SparseOnlineGP(WhitenedState):
         variance = next_inputs.variance.to(mean.dtype).expand(*mean.shape[:-1], -1)
         return Observed(inputs, targets, mask, GaussianInputs(mean, variance, next_inputs.columns), rate)
 
-    def _absorb_block(self, block: Observed) -> None:
-        inputs, mask = block.inputs, block.mask
-        noise = self.noise_variance.unsqueeze(-1)
-        phi, novelty = self._grow(inputs, mask, noise)
+    def _absorb_block(self, block: Observed, noise: Tensor) -> None:
+        phi, novelty = self._grow(block.inputs, block.mask, noise)
         if block.next_inputs is not None and block.discount is not None:
             phi, novelty = self._difference(phi, block.inputs, block.next_inputs, block.discount)
         # moment: W = 1/(σ0² + ν); dtc ignores what the basis misses
         variance = noise + novelty if self.projection == "moment" else noise.expand_as(novelty)
-        weight = variance.reciprocal() if mask is None else torch.where(mask, 1 / variance, 0.0)
-        rows = phi.shape[-2]
-        scaled = phi * weight.sqrt().unsqueeze(-2)
-        weighted = weight * block.targets
-        self.precision[..., :rows, :rows].add_(scaled @ scaled.mT)
-        self.information[..., :rows].add_((phi @ weighted.unsqueeze(-1)).squeeze(-1))
-        log_weight = (weight / TWO_PI).log()
-        log_weight = log_weight if mask is None else log_weight.where(mask, 0.0)
-        self.evidence_constant.sub_(0.5 * (torch.linalg.vecdot(weighted, block.targets) - log_weight.sum(-1)))
-        self.observations.add_(inputs.shape[-2] if mask is None else mask.sum(-1))
-        self._stale = True
-        if self._active().rows > self.capacity - min(self.overshoot, _churn(inputs.shape[-2])):
+        self._accumulate(phi, variance, block.targets, block.mask)
+        if self._active().rows > self.capacity - min(self.overshoot, _churn(block.inputs.shape[-2])):
             self._prune()
+
+    def _accumulate(self, phi: Tensor, variance: Tensor, targets: Tensor, mask: Tensor | None) -> None:
+        """A += Φ W Φᵀ, b += Φ W y, and the constant of the evidence, with W = 1/variance."""
+        weight, count = variance.reciprocal(), targets.shape[-1]
+        log_weight = weight.log()
+        if mask is not None:
+            weight, log_weight, count = weight * mask, log_weight * mask, mask.sum(-1)
+        scaled = phi * weight.sqrt().unsqueeze(-2)
+        weighted = weight * targets
+        precision = self.precision[..., : phi.shape[-2], : phi.shape[-2]]
+        if phi.ndim == 2:
+            precision.addmm_(scaled, scaled.mT)
+        else:
+            precision.add_(scaled @ scaled.mT)
+        self.information[..., : phi.shape[-2]].add_((phi @ weighted.unsqueeze(-1)).squeeze(-1))
+        quadratic = torch.linalg.vecdot(weighted, targets)
+        self.evidence_constant.add_(0.5 * (log_weight.sum(-1) - quadratic - count * LOG_TWO_PI))
+        self.observations.add_(count)
+        self._stale = True
 
     def _grow(self, inputs: Tensor, mask: Tensor | None, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Add the novel points of a block to the basis; φ and novelty of all of them, on the new basis."""
@@ -199,6 +210,8 @@ class SparseOnlineGP(WhitenedState):
         picks, before = selection.pivots.shape[-1], phi.shape[-2]
         if not picks:
             return phi
+        if phi.ndim == 2 and phi.device.type == "cpu":
+            return self._add_alone(selection, inputs, phi)
         rows = torch.arange(min(before + picks, self.capacity), device=phi.device)
         slots = self.size.unsqueeze(-1) + torch.arange(picks, device=phi.device)
         place = (rows.unsqueeze(-1) == slots.unsqueeze(-2)) & selection.accepted.unsqueeze(-2)  # [*b, R, J]
@@ -215,6 +228,16 @@ class SparseOnlineGP(WhitenedState):
         self.basis[..., used, :].add_(one_hot @ inputs.gather(-2, wide))
         self.stamps[..., used].copy_(torch.where(place.any(-1), self.clock, self.stamps[..., used]))
         self.size.add_(selection.accepted.sum(-1))
+        return phi
+
+    def _add_alone(self, selection: Selection, inputs: Tensor, phi: Tensor) -> Tensor:
+        """`_add` for one learner whose rows in use are known to the host: slices instead of one-hot products."""
+        before, after = phi.shape[-2], phi.shape[-2] + selection.pivots.shape[-1]
+        phi = torch.cat([phi, selection.rows])
+        self.gram_factor[before:after, :after] = phi[:, selection.pivots].mT.tril(before)
+        self.basis[before:after] = inputs[selection.pivots]
+        self.stamps[before:after] = self.clock
+        self.size.fill_(after)
         return phi
 
     def _difference(
@@ -290,7 +313,7 @@ class SparseOnlineGP(WhitenedState):
             other.zero_()
 
 
-TWO_PI = 2 * torch.pi
+LOG_TWO_PI = math.log(2 * math.pi)
 
 
 def _churn(points: int) -> int:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_gprl.gp import BasisStatistics, InformationScore, RecursiveGP, SparseOnlineGP
-from torch_gprl.gp.pruning import Whitened, keep_first
+from torch_gprl.gp.pruning import Whitened, basis_statistics, keep_first
 from torch_gprl.kernels import SquaredExponential
 
 NOISE = 0.2
@@ -33,6 +33,11 @@ def learned(*batch: int) -> SparseOnlineGP:
 
 def state(gp: SparseOnlineGP) -> Whitened:
     return Whitened(gp.gram_factor, gp.precision, gp.information)
+
+
+def seen_by_a_score(gp: SparseOnlineGP) -> BasisStatistics:
+    gp.refresh()
+    return basis_statistics(gp, int(gp.size))
 
 
 def values(whitened: Whitened) -> tuple[Tensor, Tensor]:
@@ -132,18 +137,17 @@ def test_scores_and_statistics_are_those_of_the_recursion(kind):
     gp = SparseOnlineGP(KERNEL, 100, NOISE, 0.3, order="arrival").requires_grad_(False)
     for process in (twin, gp):
         process.update(inputs, targets)
-    size = int(gp.size)
-    assert size == twin.size < 70
-    ours = gp.basis_statistics()
+    assert gp.size == twin.size < 70
+    ours = seen_by_a_score(gp)
     for mine, theirs in zip(ours[:3], statistics(twin)[:3], strict=True):
-        torch.testing.assert_close(mine[:size], theirs, rtol=1e-7, atol=1e-7)
-    assert torch.equal(ours.mask, torch.arange(gp.capacity) < size)
-    torch.testing.assert_close(InformationScore(kind)(ours)[:size], twin.scores(), rtol=1e-6, atol=1e-9)
+        torch.testing.assert_close(mine, theirs, rtol=1e-7, atol=1e-7)
+    assert ours.mask.all()
+    torch.testing.assert_close(InformationScore(kind)(ours), twin.scores(), rtol=1e-6, atol=1e-9)
 
 
 def test_the_mean_score_is_the_squared_change_of_the_mean_at_the_vector_that_goes():
     gp = learned()
-    score = InformationScore("mean")(gp.basis_statistics())
+    score = InformationScore("mean")(seen_by_a_score(gp))
     for victim in range(ALL):
         order = torch.cat([torch.arange(ALL)[torch.arange(ALL) != victim], torch.tensor([victim])])
         left, _ = keep_first(state(gp), order, ALL - 1, "moment")
@@ -159,7 +163,7 @@ def test_the_kl_score_is_the_squared_signal_to_noise_ratio_of_a_coefficient():
     mean, covariance = values(state(gp))
     inverse = torch.linalg.inv(KERNEL(gp.basis, gp.basis))
     expected = (inverse @ mean).square() / (inverse @ covariance @ inverse).diagonal()
-    torch.testing.assert_close(InformationScore("kl")(gp.basis_statistics()), expected, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(InformationScore("kl")(seen_by_a_score(gp)), expected, rtol=1e-6, atol=1e-9)
 
 
 def test_an_unknown_score_is_refused(monkeypatch):
@@ -169,20 +173,21 @@ def test_an_unknown_score_is_refused(monkeypatch):
 
 
 def test_the_lowest_scores_go_and_stamps_stay_with_their_vectors():
-    def nearest_to_zero_goes(statistics: BasisStatistics) -> Tensor:
-        return gp.basis.norm(dim=-1)
+    worth = torch.randperm(ALL + 1).double()
 
-    inputs, targets = sample(ALL)
-    gp = SparseOnlineGP(KERNEL, 8, NOISE, 0.0, overshoot=5, pruning=nearest_to_zero_goes)
-    for stamp in range(ALL):
+    def by_stamp(statistics: BasisStatistics) -> Tensor:
+        return worth[statistics.stamps]
+
+    inputs, targets = sample(ALL + 1)
+    gp = SparseOnlineGP(KERNEL, 8, NOISE, 0.0, overshoot=5, pruning=by_stamp)
+    for stamp in range(ALL + 1):
+        assert gp.size == stamp
         gp.update(inputs[stamp : stamp + 1], targets[stamp : stamp + 1], stamp=stamp)
-    assert gp.size == ALL
-    far = sample(1)[0] + 10
-    gp.update(far, torch.zeros(1), stamp=ALL)  # one too many: a round of pruning
-    kept = torch.cat([inputs, far]).norm(dim=-1).topk(8).indices.sort().values
+    kept = worth.topk(8).indices.sort().values
     assert gp.size == 8
-    assert torch.equal(gp.basis[:8], torch.cat([inputs, far])[kept])
+    assert torch.equal(gp.basis[:8], inputs[kept])
     assert torch.equal(gp.stamps[:8], kept)
+    assert not gp.basis[8:].any()
 
 
 @pytest.mark.parametrize("target", [-3.0, 0.0, 2.0])

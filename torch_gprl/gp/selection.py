@@ -43,7 +43,7 @@ def select_novel(
 
 
 def _pick_alone(residual_gram: Tensor, novelty: Tensor, threshold: Tensor, limit: Tensor) -> Selection:
-    """One learner: the picks are host numbers, and every step works on views. Twice as fast as a batch of 1."""
+    """One learner: the picks are host numbers, and steps work on views. Twice as fast as a batch of 1."""
     most = min(int(limit), novelty.shape[0])
     excess, novelty = novelty - threshold, novelty.clone()
     rows = residual_gram.new_empty(most, novelty.shape[0])

@@ -1,34 +1,33 @@
 """The sparse online Gaussian process: Bayes' rule on blocks of data, with a bounded basis.
 
-Absorbing a block adds Φ W Φᵀ to A and Φ W y to b (see `whitened`): one matrix product, whatever the order of the
-data, and learners with one basis merge by adding. Sources: Csató and Opper (2002), "Sparse on-line Gaussian
-processes"; the thesis' equations (.5) to (.13); Engel, Mannor and Meir (2005) for temporal differences. The
-textbook recursion in α, C and K⁻¹, which loses its digits, is `RecursiveGP`.
+Absorbing a block adds Φ W Φᵀ to A and Φ W y to b (see `whitened`): one matrix product, whatever the order of
+the data, and learners with one basis merge by adding. Sources: Csató and Opper (2002), "Sparse on-line
+Gaussian processes"; the thesis' equations (.5) to (.13); Engel, Mannor and Meir (2005) for temporal
+differences. The textbook recursion in α, C and K⁻¹, which loses its digits, is `RecursiveGP`.
 """
 
 import math
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torch_gprl.gp.door import admit_data
 from torch_gprl.gp.pruning import InformationScore, PruningScore, Whitened, basis_statistics, keep_first
 from torch_gprl.gp.selection import Selection, select_novel
-from torch_gprl.gp.whitened import WhitenedState
+from torch_gprl.gp.whitened import NOVELTY_FLOOR, WhitenedState
 from torch_gprl.kernels.base import Kernel
 from torch_gprl.kernels.gaussian_inputs import GaussianInputs
 
 BLOCK = 256  # points absorbed at once; longer updates are cut into blocks of this size
-# A full basis admits at most one in so many points of a block: every swap projects the past. Of 4, 8, 16, 32 and
-# 64, on streams of 12,800 points, 32 predicted best or within 2 % of it, and 4 worst.
+# A full basis admits at most one in so many points of a block, since every swap projects the past. Of 4, 8,
+# 16, 32 and 64, on streams of 12,800 points, 32 predicted best or within 2 % of it, and 4 worst.
 CHURN = 32
-NOVELTY_FLOOR = {torch.float64: 1e-10, torch.float32: 1e-4}  # of the prior variance: below is roundoff
 
 
 class Observed(NamedTuple):
-    """A block of linear observations of f: y = f(x) − γ f(x') + noise, the second term for transitions only."""
+    """A block of linear observations y = f(x) − γ f(x') + noise; the second term for transitions only."""
 
     inputs: Float[Tensor, "*batch N D"]
     targets: Float[Tensor, "*batch N"]
@@ -231,7 +230,7 @@ class SparseOnlineGP(WhitenedState):
         return phi
 
     def _add_alone(self, selection: Selection, inputs: Tensor, phi: Tensor) -> Tensor:
-        """`_add` for one learner whose rows in use are known to the host: slices instead of one-hot products."""
+        """`_add` for one learner on the CPU, its size known to the host: slices, not one-hot products."""
         before, after = phi.shape[-2], phi.shape[-2] + selection.pivots.shape[-1]
         phi = torch.cat([phi, selection.rows])
         self.gram_factor[before:after, :after] = phi[:, selection.pivots].mT.tril(before)

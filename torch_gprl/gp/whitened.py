@@ -17,7 +17,9 @@ parameters, have changed.
 | σ0² | `noise_variance` | variance of the noise on targets |
 """
 
-from typing import NamedTuple
+import warnings
+from collections.abc import Callable
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -27,6 +29,9 @@ from torch_gprl.gp.door import admit_inputs
 from torch_gprl.gp.posterior import Posterior
 from torch_gprl.kernels.base import Kernel
 from torch_gprl.linalg import cholesky
+
+# Novelty below this part of the prior variance is roundoff, and no reason to add a basis vector.
+NOVELTY_FLOOR = {torch.float64: 1e-10, torch.float32: 1e-4}
 
 
 class Active(NamedTuple):
@@ -48,7 +53,7 @@ class WhitenedState(nn.Module):
         batch_shape: leading dimensions of everything.
 
     Raises:
-        ValueError: a noise variance that is not positive and finite.
+        ValueError: a noise variance that is not positive and finite, or a kernel neither float64 nor float32.
     """
 
     basis: Float[Tensor, "*batch B D"]
@@ -71,6 +76,7 @@ class WhitenedState(nn.Module):
         self.capacity = capacity
         self.batch_shape = batch_shape
         like = next(kernel.parameters())
+        _check_dtype(like.dtype)
         noise = torch.as_tensor(noise_variance, dtype=like.dtype, device=like.device).expand(batch_shape)
         if not bool((torch.isfinite(noise) & (noise > 0)).all()):
             raise ValueError(f"noise_variance must be positive and finite, got {noise_variance}")
@@ -208,6 +214,12 @@ class WhitenedState(nn.Module):
         self._state_seen: tuple[int, ...] = ()
         self._active_seen: tuple[int, ...] = ()
 
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        super()._apply(fn, recurse)
+        _check_dtype(self.basis.dtype)
+        self._accept_state()
+        return self
+
     def _kernel_versions(self) -> tuple[int, ...]:
         return tuple(parameter._version for parameter in self._kernel_parameters)
 
@@ -256,6 +268,17 @@ class WhitenedState(nn.Module):
         eye = torch.eye(self.capacity, dtype=self.basis.dtype, device=self.basis.device)
         precision = eye + change.mT @ (self.precision - eye) @ change  # I + L'ᵀΛL'
         return precision, (change * self.information.unsqueeze(-1)).sum(-2)  # L'ᵀh
+
+
+def _check_dtype(dtype: torch.dtype) -> None:
+    if dtype not in NOVELTY_FLOOR:
+        raise ValueError(f"a Gaussian process needs a kernel in float64 (or float32), got {dtype}")
+    if dtype != torch.float64:
+        warnings.warn(
+            f"this Gaussian process keeps its state in {dtype}: novelty below {NOVELTY_FLOOR[dtype]:g} of "
+            "the prior variance is lost in rounding; float64 costs little, and only memory speaks against it",
+            stacklevel=3,
+        )
 
 
 def _after_load(module: nn.Module, keys: object) -> None:

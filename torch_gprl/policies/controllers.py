@@ -58,7 +58,7 @@ class Controller(nn.Module, ABC):
 
     def _generators(self, seed: int, first_learner: int) -> list[torch.Generator]:
         count = self.batch_shape[0] if self.batch_shape else 1
-        return learner_generators(seed, range(first_learner, first_learner + count))
+        return learner_generators(seed, range(first_learner, first_learner + count), "weights")
 
     def _normal(self, generators: list[torch.Generator], shape: Sequence[int]) -> Tensor:
         """Standard normal [*batch, *shape], each learner's numbers from its own generator."""

@@ -1,18 +1,23 @@
 """Random numbers by learner: what learner i draws does not depend on how many others learn beside it."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-LEARNER_STRIDE = (
-    1_000_003  # keeps the seeds of (seed, learner) pairs apart; a prime above any count of learners
-)
+# keeps the seeds of (seed, learner) pairs apart; a prime above any count of learners
+LEARNER_STRIDE = 1_000_003
+PURPOSES = ("weights", "exploration")  # or a learner's exploration would repeat the numbers of its weights
 
 
-def learner_generators(seed: int, learners: Sequence[int]) -> list[torch.Generator]:
-    """One CPU generator for each learner index, seeded by the pair (seed, learner)."""
-    return [torch.Generator().manual_seed(seed * LEARNER_STRIDE + index) for index in learners]
+def learner_generators(
+    seed: int, learners: Sequence[int], purpose: Literal["weights", "exploration"]
+) -> list[torch.Generator]:
+    """One CPU generator for each learner index, seeded by (seed, learner, purpose)."""
+    numbers = [seed * LEARNER_STRIDE + index for index in learners]
+    offset = PURPOSES.index(purpose)
+    return [torch.Generator().manual_seed(len(PURPOSES) * number + offset) for number in numbers]
 
 
 def stacked_normal(generators: Sequence[torch.Generator], shape: Sequence[int]) -> Tensor:
@@ -30,7 +35,7 @@ class NoiseStream:
     BLOCK = 64  # steps drawn at once
 
     def __init__(self, seed: int, learners: Sequence[int]) -> None:
-        self._generators = learner_generators(seed, learners)
+        self._generators = learner_generators(seed, learners, "exploration")
         self._block: Tensor | None = None
         self._next = 0
 
@@ -45,7 +50,7 @@ class NoiseStream:
             self._next = 0
         noise = self._block[:, self._next]
         self._next += 1
-        return noise
+        return noise.to(like)  # a restored block comes from the CPU
 
     def state(self) -> dict[str, Tensor]:
         """Tensors that `restore` takes."""
@@ -56,6 +61,6 @@ class NoiseStream:
     def restore(self, state: dict[str, Tensor]) -> None:
         """Continue where the stream stood when `state` was taken."""
         for generator, saved in zip(self._generators, state["generators"], strict=True):
-            generator.set_state(saved)
+            generator.set_state(saved.clone())  # it does not take views
         self._block = state["block"] if state["block"].numel() else None
         self._next = int(state["next"])

@@ -19,8 +19,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from envs.philox import StartDraws
 from envs.physics import MujocoPhysics, State
+from envs.streams import StartDraws
 from envs.task import Noise, Reward, Task
 
 # pyright: reportAttributeAccessIssue=false

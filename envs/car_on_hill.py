@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from envs.philox import StartDraws
 from envs.physics import State, TorchPhysics
+from envs.streams import StartDraws
 from envs.task import Noise, Plane, Reward, Task
 
 # pyright: reportAttributeAccessIssue=false

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from envs.noise import StepNoise
-from envs.philox import StartDraws, Streams
 from envs.physics import State
+from envs.streams import StartDraws, Streams
 from envs.task import Task
 
 NOISE_BLOCKS = {"action": 64, "velocity": 128, "observation": 192}  # addresses within a step
@@ -124,9 +124,8 @@ class Copies:
 
     def save(self) -> dict[str, Tensor]:
         """All that the future depends on, as copies."""
-        episode = torch.from_numpy(self._streams.episode.astype(np.int64))
         steps = torch.from_numpy(self.steps.copy())
-        return {"physics": self._physics.rows.clone(), "steps": steps, "episode": episode}
+        return {"physics": self._physics.rows.clone(), "steps": steps, **self._streams.save()}
 
     def load(self, saved: dict[str, Tensor]) -> None:
         """Go on from what `save` gave, bit for bit.
@@ -141,7 +140,7 @@ class Copies:
             )
         self._physics.rows.copy_(saved["physics"])
         self.steps[:] = saved["steps"].numpy()
-        self._streams.episode[:] = saved["episode"].numpy().astype(np.uint64)
+        self._streams.load(saved)
         for noise in self._noise.values():
             noise.resume(self.steps)
 

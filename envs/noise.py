@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from envs.philox import Streams
+from envs.streams import Streams
 
 AHEAD = 32  # steps
 

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from envs.philox import StartDraws
 from envs.physics import MujocoPhysics, State
+from envs.streams import StartDraws
 from envs.task import Noise, Plane, Reward, Task
 
 MODEL = Path(__file__).with_suffix(".xml")

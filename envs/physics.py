@@ -9,6 +9,7 @@ simulations would, on any number of threads; torch views the same memory.
 
 import abc
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -89,20 +90,30 @@ class MujocoPhysics(Physics):
         threads: threads to step on; results do not depend on it.
         derived: names of MjData fields to keep beside positions and velocities; as after `mj_step`, they
             lag behind by one physics step.
+        persistent: keep one MjData per copy, for fields that the batch itself does not bind.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, copies: int, substeps: int, threads: int, derived: tuple[str, ...] = ()
+        self,
+        model: mujoco.MjModel,
+        copies: int,
+        substeps: int,
+        threads: int,
+        derived: tuple[str, ...] = (),
+        persistent: bool = False,
     ) -> None:
         self.model = model
-        self.batch = mujoco.batch.Batch(model, copies, nthread=threads)
+        self.batch = mujoco.batch.Batch(model, copies, nthread=threads, persistent=persistent)
         self._substeps = substeps
         self.rows = torch.from_numpy(self.batch.state)
         self._before = self.rows.clone()
         qpos, qvel, control = (self._columns(name) for name in ("qpos", "qvel", "ctrl"))
         self.qpos, self.qvel, self._control = self.rows[:, qpos], self.rows[:, qvel], self.rows[:, control]
-        self._past = State(self._before[:, qpos], self._before[:, qvel])
-        self.derived = {name: torch.from_numpy(self.batch.bind(name)) for name in derived}
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # nor do we write it
+            self.derived = {name: torch.from_numpy(self.batch.bind(name)) for name in derived}
+        self._past_derived = {name: value.clone() for name, value in self.derived.items()}
+        self._past = State(self._before[:, qpos], self._before[:, qvel], self._past_derived)
 
     @classmethod
     def of_ours(
@@ -123,6 +134,8 @@ class MujocoPhysics(Physics):
     def advance(self, control: Float[Tensor, "B nu"]) -> State:
         """Advance every copy by `substeps` physics steps; see `Physics.advance`."""
         self._before.copy_(self.rows)
+        for name, value in self.derived.items():
+            self._past_derived[name].copy_(value)
         self._control.copy_(control)
         self.batch.step(nstep=self._substeps)
         return self._past

@@ -2,15 +2,13 @@
 
 import difflib
 
-from envs import atwood, car_on_hill, cartpole, crane, pendulum
+from envs import atwood, car_on_hill, cartpole, crane, gym, pendulum
 from envs.batch import BatchEnv
 from envs.copies import Options
 from envs.task import Task
 
-ALL: dict[str, Task] = {
-    task.id: task
-    for task in (*pendulum.TASKS, *cartpole.TASKS, *atwood.TASKS, *crane.TASKS, *car_on_hill.TASKS)
-}
+SYSTEMS = (pendulum, cartpole, atwood, crane, car_on_hill, gym)
+ALL: dict[str, Task] = {task.id: task for system in SYSTEMS for task in system.TASKS}
 
 
 def find(task_id: str) -> Task:

@@ -21,8 +21,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from envs.philox import StartDraws
 from envs.physics import Physics, State
+from envs.streams import StartDraws
 
 
 class Reward(NamedTuple):

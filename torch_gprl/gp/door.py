@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from torch_gprl.kernels.gaussian_inputs import GaussianInputs
+
 
 def admit_inputs(inputs: Tensor, batch_shape: torch.Size, like: Tensor) -> Tensor:
     """Inputs [*batch, N, D] in the dtype of `like` [*batch, B, D], expanded to `batch_shape`.
@@ -18,6 +20,14 @@ def admit_inputs(inputs: Tensor, batch_shape: torch.Size, like: Tensor) -> Tenso
             "a single point is inputs[..., None, :]"
         )
     return inputs.to(like.dtype).expand(*batch_shape, *inputs.shape[-2:])
+
+
+def admit_points(points: Tensor | GaussianInputs, batch_shape: torch.Size, like: Tensor) -> GaussianInputs:
+    """Points where f, or its average over Gaussian columns, is asked for; see `admit_inputs`."""
+    if not isinstance(points, GaussianInputs):
+        return GaussianInputs.exactly(admit_inputs(points, batch_shape, like))
+    mean = admit_inputs(points.mean, batch_shape, like)
+    return GaussianInputs(mean, points.variance.to(like.dtype).expand(*mean.shape[:-1], -1), points.columns)
 
 
 def admit_data(

@@ -243,13 +243,11 @@ class SparseOnlineGP(WhitenedState):
         self, phi: Tensor, inputs: Tensor, following: GaussianInputs, discount: Tensor
     ) -> tuple[Tensor, Tensor]:
         """φ and novelty of f(x) − γ f(x'), from φ of x."""
-        active, kernel = self._active(), self.kernel
-        next_phi = self._whitened(kernel.expected(following, active.basis).mT, active)
-        difference = phi - discount.unsqueeze(-2) * next_phi
-        shared = kernel.expected(following, inputs).diagonal(dim1=-2, dim2=-1)
-        own = kernel.expected(following, following).diagonal(dim1=-2, dim2=-1)
+        difference = phi - discount.unsqueeze(-2) * self._averaged_features(following)
+        shared = self.kernel.expected_pairs(following, GaussianInputs.exactly(inputs))
+        own = self._prior_variance(following)
         # Var[f(x) − γ f(x')] = k(x, x) − 2γ k(x, x') + γ² k(x', x')
-        prior = kernel.diag(inputs) - 2 * discount * shared + discount.square() * own
+        prior = self.kernel.diag(inputs) - 2 * discount * shared + discount.square() * own
         return difference, prior - torch.linalg.vecdot(difference, difference, dim=-2)
 
     def _prune(self) -> None:

@@ -19,15 +19,16 @@ parameters, have changed.
 
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torch_gprl.gp.door import admit_inputs
+from torch_gprl.gp.door import admit_inputs, admit_points
 from torch_gprl.gp.posterior import Posterior
 from torch_gprl.kernels.base import Kernel
+from torch_gprl.kernels.gaussian_inputs import GaussianInputs
 from torch_gprl.linalg import cholesky
 
 # Novelty below this part of the prior variance is roundoff, and no reason to add a basis vector.
@@ -129,20 +130,23 @@ class WhitenedState(nn.Module):
         half = _solve(self.precision_factor, inverse_factor)
         return half.mT @ half - inverse_factor.mT @ inverse_factor
 
-    def posterior(self, inputs: Float[Tensor, "*#batch N D"]) -> Posterior:
-        """Mean and variance of f (without noise) at `inputs`, [*batch, N] each; differentiable in them."""
+    def posterior(self, inputs: Float[Tensor, "*#batch N D"] | GaussianInputs) -> Posterior:
+        """Mean and variance of f (without noise) at `inputs`, [*batch, N] each; differentiable in them.
+
+        For `GaussianInputs` those of the average of f over the Gaussian columns, in closed form.
+        """
         self.refresh()
-        inputs = admit_inputs(inputs, self.batch_shape, self.basis)
-        phi, half = self._project(inputs)
+        points = admit_points(inputs, self.batch_shape, self.basis)
+        phi, half = self._project(points)
         mean = (self.weights[..., None, : phi.shape[-2]] @ phi).squeeze(-2)
         # k** − φᵀφ + φᵀA⁻¹φ
-        return Posterior(mean, self.kernel.diag(inputs) - _square(phi) + _square(half))
+        return Posterior(mean, self._prior_variance(points) - _square(phi) + _square(half))
 
-    def mean(self, inputs: Float[Tensor, "*#batch N D"]) -> Float[Tensor, "*batch N"]:
+    def mean(self, inputs: Float[Tensor, "*#batch N D"] | GaussianInputs) -> Float[Tensor, "*batch N"]:
         """Posterior mean alone [*batch, N], several times cheaper than `posterior`."""
-        inputs = admit_inputs(inputs, self.batch_shape, self.basis)
+        points = admit_points(inputs, self.batch_shape, self.basis)
         alpha, active = self.alpha, self._active()
-        return (self.kernel(inputs, active.basis) @ alpha[..., : active.rows, None]).squeeze(-1)
+        return (self.kernel.expected(points, active.basis) @ alpha[..., : active.rows, None]).squeeze(-1)
 
     def forward(
         self, inputs: Float[Tensor, "*#batch N D"]
@@ -155,7 +159,7 @@ class WhitenedState(nn.Module):
         """Joint posterior of f at `inputs`, for sampling whole functions."""
         self.refresh()
         inputs = admit_inputs(inputs, self.batch_shape, self.basis)
-        phi, half = self._project(inputs)
+        phi, half = self._project(GaussianInputs.exactly(inputs))
         covariance = self.kernel(inputs, inputs) - phi.mT @ phi + half.mT @ half
         mean = (self.weights[..., None, : phi.shape[-2]] @ phi).squeeze(-2)
         factor = cholesky(covariance)
@@ -214,7 +218,7 @@ class WhitenedState(nn.Module):
         self._state_seen: tuple[int, ...] = ()
         self._active_seen: tuple[int, ...] = ()
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "WhitenedState":
         super()._apply(fn, recurse)
         _check_dtype(self.basis.dtype)
         self._accept_state()
@@ -250,9 +254,20 @@ class WhitenedState(nn.Module):
     def _whitened(self, cross: Tensor, active: Active) -> Tensor:
         return _solve(active.gram_factor, cross if active.mask is None else cross * active.mask)
 
-    def _project(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+    def _averaged_features(self, points: GaussianInputs) -> Float[Tensor, "*batch R N"]:
+        """E[φ(x)] over the Gaussian columns of x."""
+        if not points.columns:
+            return self._features(points.mean)
+        active = self._active()
+        return self._whitened(self.kernel.expected(points, active.basis).mT, active)
+
+    def _prior_variance(self, points: GaussianInputs) -> Float[Tensor, "*batch N"]:
+        """Prior variance of f, averaged over the Gaussian columns, at each point."""
+        return self.kernel.expected_pairs(points, points) if points.columns else self.kernel.diag(points.mean)
+
+    def _project(self, points: GaussianInputs) -> tuple[Tensor, Tensor]:
         """φ and R⁻¹φ with A = RRᵀ: what the basis explains of x, and what the data left open of that."""
-        phi = self._features(inputs)
+        phi = self._averaged_features(points)
         rows = phi.shape[-2]
         return phi, _solve(self.precision_factor[..., :rows, :rows], phi)
 

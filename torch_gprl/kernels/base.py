@@ -65,6 +65,14 @@ class Kernel(nn.Module, ABC):
             return self._expected(x, other)
         return self(x.mean, other.mean)
 
+    def expected_pairs(self, x: GaussianInputs, z: GaussianInputs) -> PerPoint:
+        """E[k(x_i, z_i)] of each row of x with the same row of z, independent draws: [*batch, N].
+
+        Raises:
+            NotImplementedError: no closed form, see `expected`.
+        """
+        return self.expected(x.points_first(), z.points_first()).movedim(0, -1).flatten(-3)
+
     def _expected(self, x: GaussianInputs, z: GaussianInputs) -> Tensor:
         raise NotImplementedError(
             f"{type(self).__name__} has no closed form average over Gaussian columns; use "

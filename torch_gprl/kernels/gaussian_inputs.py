@@ -49,6 +49,11 @@ class GaussianInputs:
         source = [self.columns.index(columns[i]) for i in kept]
         return GaussianInputs(self.mean[..., list(columns)], self.variance[..., source], tuple(kept))
 
+    def points_first(self) -> "GaussianInputs":
+        """Every point on its own, its index as the first batch dimension: means [N, *batch, 1, D]."""
+        mean, variance = (t.movedim(-2, 0).unsqueeze(-2) for t in (self.mean, self.variance))
+        return GaussianInputs(mean, variance, self.columns)
+
     def full_variance(self) -> Inputs:
         """Variance of every column [*batch, N, D]: zero where the column is known."""
         batch = torch.broadcast_shapes(self.mean.shape[:-1], self.variance.shape[:-1])

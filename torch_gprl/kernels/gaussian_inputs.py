@@ -47,7 +47,7 @@ class GaussianInputs:
         """The given columns alone, numbered anew."""
         kept = [i for i, column in enumerate(columns) if column in self.columns]
         source = [self.columns.index(columns[i]) for i in kept]
-        return GaussianInputs(self.mean[..., list(columns)], self.variance[..., source], tuple(kept))
+        return GaussianInputs(_columns(self.mean, columns), _columns(self.variance, source), tuple(kept))
 
     def points_first(self) -> "GaussianInputs":
         """Every point on its own, its index as the first batch dimension: means [N, *batch, 1, D]."""
@@ -58,5 +58,13 @@ class GaussianInputs:
         """Variance of every column [*batch, N, D]: zero where the column is known."""
         batch = torch.broadcast_shapes(self.mean.shape[:-1], self.variance.shape[:-1])
         zero = self.variance.new_zeros(*batch, self.mean.shape[-1])
-        index = torch.tensor(self.columns, dtype=torch.long, device=zero.device)
-        return zero.index_copy(-1, index, self.variance.expand(*batch, len(self.columns)))
+        variance = self.variance.expand(*batch, len(self.columns))
+        known = [zero[..., column] for column in range(self.mean.shape[-1])]
+        for i, column in enumerate(self.columns):
+            known[column] = variance[..., i]
+        return torch.stack(known, -1)
+
+
+def _columns(tensor: Tensor, columns: Sequence[int]) -> Tensor:
+    """Columns of a tensor, without an index tensor, which would have to travel to the device first."""
+    return torch.stack([tensor[..., column] for column in columns], -1) if columns else tensor[..., :0]

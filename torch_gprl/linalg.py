@@ -23,7 +23,8 @@ def cholesky(matrix: SquareMatrix, max_jitter: float | None = None) -> SquareMat
 
     Reads the lower triangle only. Entries that fail are tried again with jitter · mean(diagonal) added to
     their diagonal, the jitter growing tenfold from 100 machine epsilons. Differentiable; the jitter counts as
-    a constant. Costs one host synchronisation, to ask whether any entry failed.
+    a constant. Costs one host synchronisation, to ask whether any entry failed. In a
+    compiled graph there is no second try.
 
     Args:
         matrix: symmetric positive semi-definite matrices [*batch, N, N].
@@ -33,6 +34,8 @@ def cholesky(matrix: SquareMatrix, max_jitter: float | None = None) -> SquareMat
     Raises:
         CholeskyError: an entry holds NaN or infinity, or is not positive definite with the largest jitter.
     """
+    if torch.compiler.is_compiling():  # a graph cannot branch on `info`; this one raises by itself
+        return torch.linalg.cholesky(matrix)
     factor, info = torch.linalg.cholesky_ex(matrix)
     if _succeeded(factor, info):
         return factor

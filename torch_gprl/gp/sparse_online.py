@@ -164,7 +164,8 @@ class SparseOnlineGP(WhitenedState):
         # moment: W = 1/(σ0² + ν); dtc ignores what the basis misses
         variance = noise + novelty if self.projection == "moment" else noise.expand_as(novelty)
         self._accumulate(phi, variance, block.targets, block.mask)
-        if self._active().rows > self.capacity - min(self.overshoot, _churn(block.inputs.shape[-2])):
+        room = min(self.overshoot, _churn(block.inputs.shape[-2]))  # for the additions of the next block
+        if bool((self.size > self.capacity - room).any()):
             self._prune()
 
     def _accumulate(self, phi: Tensor, variance: Tensor, targets: Tensor, mask: Tensor | None) -> None:

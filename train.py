@@ -50,6 +50,7 @@ CHECKPOINT_INTERVAL = 60.0  # s
 GRID = 61  # points of the value surface in each direction
 POINTS_AT_ONCE = 500  # of the value surface, for each learner: bounds the memory
 LONGEST_FILM = 300  # frames
+STDERR = 2  # file descriptor
 BOX_SIDES, BOX_RULES = "│| ", "─-"  # how tyro draws with UTF-8 and without
 
 
@@ -235,7 +236,7 @@ class StopRequest:
         self.asked = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
         # print may be what was interrupted, and does not bear a second call inside the first.
-        os.write(sys.stderr.fileno(), b"\nfinishing this update; Ctrl-C again aborts\n")
+        os.write(STDERR, b"\nfinishing this update; Ctrl-C again aborts\n")
 
 
 def summary(returns: Tensor) -> str:

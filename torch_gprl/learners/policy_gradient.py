@@ -6,7 +6,7 @@ teach the critic. All learners at once, each on its own experience.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -25,6 +25,9 @@ FIRST_FIT, LATER_FITS = 50, 20  # steps of the optimiser: later fits start from 
 FISHER_EVERY = 4  # one step in four of a rollout enters the Fisher matrix
 FIRST_NOISE = 0.05  # noise variance of standardised targets before the first fit
 
+ControllerForm = Literal["linear", "rbf", "mlp"]
+Optimiser = Literal["natural", "adam"]
+
 
 @dataclass(frozen=True)
 class PolicyGradientConfig:
@@ -35,9 +38,9 @@ class PolicyGradientConfig:
     discount: float = 0.98  # γ per environment step, from 0 to 1
     horizon: int = 200  # real rewards before the critic's value takes over in (.7); 0 is the critic alone
     baseline: bool = True  # subtract Q(s, f(s)), the critic's value of the controller's own action
-    controller: Literal["linear", "rbf", "mlp"] = "mlp"  # form of the controller f(s)
+    controller: ControllerForm = "mlp"  # form of the controller f(s)
     std: float = 0.5  # initial exploration standard deviation, in halves of the actuator's range
-    optimiser: Literal["natural", "adam"] = "natural"  # natural gradient in a trust region, or Adam
+    optimiser: Optimiser = "natural"  # natural gradient in a trust region, or Adam
     trust_region: float = 0.02  # KL divergence of the first natural step, nats; falls linearly to 0
     learning_rate: float = 0.01  # of Adam; falls linearly to 0
     budget: int = 150  # basis vectors of the critic
@@ -60,6 +63,9 @@ class PolicyGradientConfig:
             raise ValueError(f"discount must lie between 0 and 1, got {self.discount}")
         if self.horizon < 0:
             raise ValueError(f"horizon must be at least 0 steps, got {self.horizon}")
+        for name, choices in (("controller", get_args(ControllerForm)), ("optimiser", get_args(Optimiser))):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
 
 
 class PolicyGradient:

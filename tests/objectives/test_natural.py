@@ -94,7 +94,7 @@ def test_units_of_the_features_do_not_matter():
     mixing = torch.randn(DIMS, DIMS, dtype=torch.float64) + 3 * torch.eye(DIMS, dtype=torch.float64)
     weight, states = parameter(DIMS), torch.randn(LEARNERS, 200, DIMS, dtype=torch.float64)
     assert weight.grad is not None
-    # s' = s M and w' = M⁻¹ w give the same actions; the gradient becomes Mᵀ-transformed
+    # s' = s M and w' = M⁻¹w give the same actions; ∂/∂w' = Mᵀ ∂/∂w
     mixed = nn.Parameter(torch.linalg.solve(mixing, weight.detach().unsqueeze(-1)).squeeze(-1))
     mixed.grad = weight.grad @ mixing
     natural_step([weight], linear_divergence(weight, states), TRUST, damping=0.0)
@@ -125,17 +125,21 @@ def test_a_learner_without_a_gradient_stays_where_it_is():
 
 
 def test_a_parameter_without_a_gradient_counts_as_flat():
-    weight, other, states = parameter(DIMS), parameter(DIMS), features()
-    other.grad = None
-    before = weight.detach().clone()
-    both = torch.cat([states, states.flip(-1)], -1)
+    weight, other, states = parameter(DIMS), parameter(DIMS), torch.cat([features(), features()], -1)
+    moved = []
+    for flat in (None, torch.zeros_like(other)):
+        pair = [nn.Parameter(p.detach().clone()) for p in (weight, other)]
+        pair[0].grad, pair[1].grad = weight.grad, flat
+        start = torch.cat([weight, other], -1).detach()
 
-    def divergence() -> Tensor:
-        pair = torch.cat([weight - before, other - other.detach()], -1).unsqueeze(-1)
-        return ((both @ pair).square() / (2 * STD**2)).mean((-2, -1))
+        def divergence(pair: list[nn.Parameter] = pair, start: Tensor = start) -> Tensor:
+            shift = (states @ (torch.cat(pair, -1) - start).unsqueeze(-1)).squeeze(-1)
+            return (shift.square() / (2 * STD**2)).mean(-1)
 
-    natural_step([weight, other], divergence, TRUST)
-    assert not torch.equal(weight, before)
+        natural_step(pair, divergence, TRUST)
+        moved.append(torch.cat(pair, -1).detach())
+    assert torch.equal(moved[0], moved[1])
+    assert not torch.equal(moved[0], start)
 
 
 @pytest.mark.parametrize("size", [1, 5, 12])

@@ -2,7 +2,10 @@
 
 from envs.batch import BatchEnv
 from envs.copies import Options
+from envs.gymnasium_env import register
 from envs.registry import ALL, make
 from envs.task import Noise, Plane, Task
+
+register()
 
 __all__ = ["ALL", "BatchEnv", "Noise", "Options", "Plane", "Task", "make"]

@@ -4,12 +4,8 @@ Time limits set `truncated`, the task's rule sets `terminated`, and the two are 
 can be bootstrapped at time limits.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco takes its names from compiled modules, which pyright cannot read)
-
 import math
 
-import mujoco
 import torch
 from jaxtyping import Float, UInt8
 from tensordict import TensorDict, TensorDictBase
@@ -18,7 +14,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from envs.copies import Copies, Options
-from envs.rendering import Picture
+from envs.rendering import Pictures
 from envs.task import Plane, Task
 
 FLAGS = ("terminated", "truncated", "done")
@@ -51,7 +47,7 @@ class BatchEnv(EnvBase):
         self.task, self.options = task, options
         self.plane: Plane | None = task.plane
         self._copies = Copies(task, options)
-        self._pictures: dict[tuple[int, int], Picture] = {}
+        self._pictures = Pictures(task)
         self._make_specs()
 
     @property
@@ -187,7 +183,4 @@ class BatchEnv(EnvBase):
         self, learner: int = 0, env: int = 0, width: int = 480, height: int = 480
     ) -> UInt8[Tensor, "H W 3"]:
         """A picture of one environment's present state."""
-        if (width, height) not in self._pictures:
-            model = mujoco.MjModel.from_xml_path(str(self.task.scene))
-            self._pictures[width, height] = Picture(model, self.task.pose, width, height)
-        return torch.from_numpy(self._pictures[width, height].frame(self.qpos[learner, env].numpy()))
+        return torch.from_numpy(self._pictures.frame(self.qpos[learner, env].numpy(), width, height))

@@ -20,6 +20,7 @@ from envs.streams import StartDraws, Streams
 from envs.task import Task
 
 NOISE_BLOCKS = {"action": 64, "velocity": 128, "observation": 192}  # addresses within a step
+LONGEST_HORIZON = 2**24 - 1  # steps that the random numbers' addresses have room for
 COPIES_PER_THREAD = 64  # fewer copies than this are not worth waking another thread for
 
 
@@ -51,6 +52,8 @@ class Options:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{name} must be at least {least}, not {value}")
+        if self.horizon is not None and self.horizon > LONGEST_HORIZON:
+            raise ValueError(f"horizon must be at most {LONGEST_HORIZON}, not {self.horizon}")
         for name in ("observation_noise", "action_noise", "velocity_noise"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < math.inf:

@@ -7,6 +7,8 @@ points: project, fill the hull, farthest shape first. No shadows and no textures
 # pyright: reportAttributeAccessIssue=false
 # (mujoco takes its names from compiled modules, which pyright cannot read)
 
+import itertools
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +17,11 @@ from PIL import Image, ImageDraw
 SKY = (236, 241, 246)
 OVERSAMPLING = 2  # drawn larger by this factor, then scaled down: smooth edges
 SUN = np.array([-0.35, -0.5, 0.8])  # direction towards the light
-GROUND_TILES = 12  # squares along each side of a ground plane
+GROUND_TILES = 16  # squares along each side of the floor that is drawn
+LARGEST_TILE = 1.0  # m
+FOCUS = 4.0  # m before the camera lies the middle of the floor that is drawn, if it looks at no floor
+FARTHEST_FOCUS = 12.0  # m
+TILES = ((226, 228, 226), (214, 216, 214))
 
 Points = NDArray[np.float64]
 
@@ -116,36 +122,42 @@ class Sketch:
         return middle + self._focal * np.stack([x / depth, -y / depth], axis=-1)
 
     def _draw_shape(self, canvas: ImageDraw.ImageDraw, geom: mujoco.MjvGeom) -> None:
-        points = surface(geom.type, np.array(geom.size, dtype=float))
+        size, middle = np.array(geom.size, dtype=float), np.array(geom.pos, dtype=float)
+        points = surface(geom.type, size)
         if points is None:
             return
-        pixels = self._project(points @ np.array(geom.mat, dtype=float).reshape(3, 3).T + np.array(geom.pos))
+        pixels = self._project(points @ np.array(geom.mat, dtype=float).reshape(3, 3).T + middle)
         if pixels is None:
             return
         outline = hull(pixels)
         colour = np.array(geom.rgba[:3], dtype=float)
         canvas.polygon(_flat(outline), fill=_rgb(colour), outline=_rgb(0.6 * colour), width=OVERSAMPLING)
         if geom.type != mujoco.mjtGeom.mjGEOM_BOX:  # a gleam makes round things round
-            centre = outline.mean(axis=0)
-            lift = self._axes[:2] @ SUN * (1, -1) * 0.2 * np.ptp(outline, axis=0).min()
-            canvas.polygon(_flat(centre + 0.5 * (outline - centre) + lift), fill=_rgb(0.75 * colour + 0.25))
+            radius = self._focal * size[0] / self._distance(geom)
+            centre = outline.mean(axis=0) + 0.35 * radius * self._axes[:2] @ SUN * (1, -1)
+            canvas.polygon(_flat(centre + 0.5 * (outline - outline.mean(axis=0))), _rgb(0.75 * colour + 0.25))
 
     def _draw_ground(self, canvas: ImageDraw.ImageDraw, geom: mujoco.MjvGeom) -> None:
-        """A chequered floor, tile by tile, so that tiles behind the eye can be left out."""
-        half = [float(extent) or 10.0 for extent in geom.size[:2]]
-        xs, ys = (np.linspace(-extent, extent, GROUND_TILES + 1) for extent in half)
+        """A chequered floor of fixed tiles around where the camera looks, without those behind the eye."""
         mat, pos = np.array(geom.mat, dtype=float).reshape(3, 3), np.array(geom.pos, dtype=float)
-        for i in range(GROUND_TILES):
-            for j in range(GROUND_TILES):
-                square = [
-                    (xs[i], ys[j], 0),
-                    (xs[i + 1], ys[j], 0),
-                    (xs[i + 1], ys[j + 1], 0),
-                    (xs[i], ys[j + 1], 0),
-                ]
-                pixels = self._project(np.array(square) @ mat.T + pos)
-                if pixels is not None:
-                    canvas.polygon(_flat(pixels), fill=(214, 216, 214) if (i + j) % 2 else (226, 228, 226))
+        half = np.array([extent or np.inf for extent in geom.size[:2]], dtype=float)
+        tile = min(LARGEST_TILE, half.min() / 6)
+        first = np.floor(self._aim(mat, pos) / tile).astype(int) - GROUND_TILES // 2
+        lines = (first[:, None] + np.arange(GROUND_TILES + 1)) * tile
+        xs, ys = np.clip(lines, -half[:, None], half[:, None])
+        for i, j in itertools.product(range(GROUND_TILES), repeat=2):
+            square = np.array([(xs[i + a], ys[j + b], 0) for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))])
+            pixels = self._project(square @ mat.T + pos)
+            if pixels is not None and xs[i] < xs[i + 1] and ys[j] < ys[j + 1]:
+                canvas.polygon(_flat(pixels), fill=TILES[(first.sum() + i + j) % 2])
+
+    def _aim(self, mat: Points, pos: Points) -> Points:
+        """Where on a plane the camera looks, in the plane's coordinates [2]."""
+        forward = self._axes[2]
+        steepness = forward @ mat[:, 2]
+        away = (pos - self._eye) @ mat[:, 2] / steepness if abs(steepness) > 1e-9 else np.inf
+        away = away if 0 < away < FARTHEST_FOCUS else FOCUS
+        return ((self._eye + away * forward - pos) @ mat)[:2]
 
 
 def _flat(polygon: Points) -> list[tuple[float, float]]:

@@ -22,6 +22,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from envs.models import stripped
+
 LARGEST = 1e10  # beyond it MuJoCo calls a state divergent (mjMAXVAL)
 BAD_STATE = [
     int(mujoco.mjtWarning.mjWARN_BADQPOS),
@@ -210,17 +212,3 @@ class TorchPhysics(Physics):
     def restore(self, rows: Bool[Tensor, " B"]) -> None:
         """Put back the state before the last step; see `Physics.restore`."""
         self.rows[rows] = self._before[rows]
-
-
-def stripped(path: Path) -> mujoco.MjModel:
-    """The model of a file without what only the eye needs: geoms, lights, cameras, sites, drawn ropes.
-
-    Only for models without contacts whose bodies give their inertia explicitly. Trajectories are those of the
-    whole model to the last bit; a step is cheaper because nothing is placed that nobody looks at.
-    """
-    spec = mujoco.MjSpec.from_file(str(path))
-    moved_by_hand = [body for body in spec.bodies if body.mocap]
-    for group in (spec.tendons, spec.geoms, spec.lights, spec.cameras, spec.sites, moved_by_hand):
-        for element in group:
-            spec.delete(element)
-    return spec.compile()

@@ -1,6 +1,6 @@
 """Pictures of a simulation: by OpenGL where the machine has it, by a plain drawing where it has not.
 
-`Picture` holds the full model of a task (the simulated one is stripped of what only the eye needs), puts a
+A `Picture` holds the whole model of a task (the simulated one is stripped of what only the eye needs), puts a
 state into it and draws. OpenGL without a screen comes from EGL or OSMesa; `MUJOCO_GL` (egl, osmesa, glfw, or
 disable) overrides the choice.
 """
@@ -12,17 +12,18 @@ import ctypes
 import importlib
 import os
 import warnings
-from collections.abc import Callable
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from envs.drawing import Sketch
+from envs.models import load
+from envs.task import Task
 
 LIBRARIES = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}  # platform -> what it loads
 MAX_GEOMS = 1000
-CAMERA = "view"  # the camera of a model that shows the task; without it, MuJoCo's free camera
+CAMERAS = ("view", "track")  # the first of them that a model has is used, else MuJoCo's free camera
 
 NO_OPENGL = (
     "no OpenGL library for drawing without a screen, so frames are plain sketches ({reason}); "
@@ -76,30 +77,26 @@ def _platform() -> str:
 
 
 class Picture:
-    """Draws states of a model.
+    """Draws states of a task in one size.
 
     Args:
-        model: the full model, with geoms, lights and cameras.
-        pose: puts positions [nq] into the model's data, with whatever only the eye needs.
+        task: the task.
         width, height: size in pixels.
     """
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        pose: Callable[[mujoco.MjModel, mujoco.MjData, NDArray[np.float64]], None],
-        width: int,
-        height: int,
-    ) -> None:
-        self._model, self._pose = model, pose
+    def __init__(self, task: Task, width: int, height: int) -> None:
+        self._model, self._pose = load(task.scene), task.pose
+        model = self._model
         self._data = mujoco.MjData(model)
         self._scene = mujoco.MjvScene(model, MAX_GEOMS)
         self._camera = mujoco.MjvCamera()
-        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, CAMERA) >= 0:
-            self._camera.fixedcamid = model.camera(CAMERA).id
-            self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        else:
-            mujoco.mjv_defaultFreeCamera(model, self._camera)
+        mujoco.mjv_defaultFreeCamera(model, self._camera)
+        named = {model.camera(i).name: i for i in range(model.ncam)}
+        for name in CAMERAS:
+            if name in named:
+                self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+                self._camera.fixedcamid = named[name]
+                break
         self._drawing = drawing(model, width, height)
 
     def frame(self, qpos: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -116,6 +113,20 @@ class Picture:
             self._scene,
         )
         return self._drawing.frame(self._scene)
+
+
+class Pictures:
+    """Draws states of a task in any size; what drawing needs is made when it is first asked for."""
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        self._sizes: dict[tuple[int, int], Picture] = {}
+
+    def frame(self, qpos: NDArray[np.float64], width: int = 480, height: int = 480) -> NDArray[np.uint8]:
+        """The picture of positions [nq]: [height, width, 3] pixels."""
+        if (width, height) not in self._sizes:
+            self._sizes[width, height] = Picture(self._task, width, height)
+        return self._sizes[width, height].frame(qpos)
 
 
 def drawing(model: mujoco.MjModel, width: int, height: int) -> OpenGL | Sketch:

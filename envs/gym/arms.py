@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from envs.gym.base import GymnasiumTask, asset, load, norm, squares
+from envs.gym.base import GymnasiumTask, asset, norm, shared, squares
 from envs.physics import State
 from envs.task import Reward
 
@@ -22,7 +22,7 @@ class Arm(GymnasiumTask):
 
     def place_of(self, body: str, state: State) -> Float[Tensor, "B 3"]:
         """Where a body is, m."""
-        return state.derived["xpos"][:, load(self.scene).body(body).id]
+        return state.derived["xpos"][:, shared(self.scene).body(body).id]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class Reacher(Arm):
 
     def start_one(self, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """An arm nearly straight, and a target within reach."""
-        model = load(self.scene)
+        model = shared(self.scene)
         qpos = rng.uniform(-0.1, 0.1, model.nq) + model.qpos0
         goal = rng.uniform(-self.GOAL_RADIUS, self.GOAL_RADIUS, 2)
         while np.linalg.norm(goal) >= self.GOAL_RADIUS:
@@ -66,7 +66,7 @@ class Pusher(Arm):
 
     def start_one(self, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The arm at rest, the cylinder anywhere that is not too near to the goal."""
-        model = load(self.scene)
+        model = shared(self.scene)
         qpos = model.qpos0.copy()
         cylinder = np.zeros(2)
         while np.linalg.norm(cylinder) <= self.CLEARANCE:

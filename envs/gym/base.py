@@ -7,9 +7,6 @@ numbers in another order than torch.
 
 import functools
 import importlib.util
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,14 +17,13 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from envs.models import load
 from envs.physics import MujocoPhysics, Physics
 from envs.streams import StartDraws
 from envs.task import Task
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco takes its names from compiled modules, which pyright cannot read)
-
-DEPRECATED = "'settotalmass' is deprecated"  # in Gymnasium's half_cheetah.xml, nothing its users can change
 
 
 def asset(file: str) -> Path:
@@ -38,27 +34,10 @@ def asset(file: str) -> Path:
     return Path(spec.submodule_search_locations[0]) / "assets" / file
 
 
-@contextmanager
-def _without_deprecation() -> Iterator[None]:
-    """Keep MuJoCo from printing about Gymnasium's models and from leaving MUJOCO_LOG.TXT behind."""
-
-    def pass_on(message: str) -> None:
-        if DEPRECATED not in message:
-            warnings.warn(message, stacklevel=2)
-
-    handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(pass_on)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(handler)
-
-
 @functools.cache
-def load(path: Path) -> mujoco.MjModel:
-    """The model of a file; shared, so treat it as read-only."""
-    with _without_deprecation():
-        return mujoco.MjModel.from_xml_path(str(path))
+def shared(path: Path) -> mujoco.MjModel:
+    """The model of a file, read once; nobody may write to it."""
+    return load(path)
 
 
 def squares(action: Float[Tensor, "B da"]) -> Float[Tensor, " B"]:
@@ -91,7 +70,7 @@ class GymnasiumTask(Task):
 
     def physics(self, copies: int, threads: int) -> Physics:
         """Gymnasium's model, as it is."""
-        return MujocoPhysics(load(self.scene), copies, self.frame_skip, threads, self.derived)
+        return MujocoPhysics(shared(self.scene), copies, self.frame_skip, threads, self.derived)
 
     def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R nq"], Float[Tensor, "R nv"]]:
         """The model's initial state with noise, drawn as Gymnasium draws it."""
@@ -100,7 +79,7 @@ class GymnasiumTask(Task):
 
     def start_one(self, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Positions [nq] and velocities [nv] of one start."""
-        model, noise = load(self.scene), self.start_noise
+        model, noise = shared(self.scene), self.start_noise
         qpos = model.qpos0 + rng.uniform(-noise, noise, model.nq)
         if self.normal_velocities:
             return qpos, noise * rng.standard_normal(model.nv)

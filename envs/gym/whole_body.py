@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from envs.gym.base import GymnasiumTask, asset, load, numpy_sum, squares
+from envs.gym.base import GymnasiumTask, asset, numpy_sum, shared, squares
 from envs.physics import MujocoPhysics, State
 from envs.task import Reward
 
@@ -60,7 +60,7 @@ class Body(GymnasiumTask):
 
     def physics(self, copies: int, threads: int) -> ContactPhysics:
         """Gymnasium's model with contact forces."""
-        return ContactPhysics(load(self.scene), copies, self.frame_skip, threads, self.derived)
+        return ContactPhysics(shared(self.scene), copies, self.frame_skip, threads, self.derived)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +139,7 @@ class Humanoid(Body):
 
     def _centre(self, state: State) -> Float[Tensor, " B"]:
         """Where along x the centre of mass was at the last physics step, added in NumPy's order."""
-        mass = load(self.scene).body_mass
+        mass = shared(self.scene).body_mass
         places = state.derived["xipos"].numpy()
         return torch.from_numpy((np.einsum("b,nbj->nj", mass, places) / mass.sum())[:, 0].copy())
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from envs import atwood
-from envs.physics import MujocoPhysics, stripped
+from envs.models import stripped
+from envs.physics import MujocoPhysics
 from tests.envs.trajectories import after_a_step, integrated, simulated
 
 BOB, COUNTERWEIGHT, GRAVITY = 1.0, 2.0, 9.81

@@ -5,7 +5,8 @@ import numpy as np
 import torch
 
 from envs import pendulum
-from envs.physics import MujocoPhysics, stripped
+from envs.models import stripped
+from envs.physics import MujocoPhysics
 
 
 def test_a_step_returns_the_state_before_it():

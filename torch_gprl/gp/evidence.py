@@ -5,6 +5,7 @@ of the kernel, if it has any, make it maximum a posteriori.
 """
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import Literal
 
@@ -16,6 +17,7 @@ from torch_gprl.gp.door import admit_data
 from torch_gprl.gp.exact import ExactGP
 from torch_gprl.gp.posterior import Posterior
 from torch_gprl.gp.sparse_online import SparseOnlineGP
+from torch_gprl.linalg import CholeskyError
 
 HELD_OUT_EVERY = 4  # one point in four judges the fit and takes no part in it
 
@@ -57,6 +59,11 @@ def fit_hyperparameters(
     inputs, targets, _ = admit_data(inputs, targets, None, gp.batch_shape, gp.basis)
     if inputs.shape[-2] < 8:
         raise ValueError(f"fitting hyper-parameters needs at least 8 points, got {inputs.shape[-2]}")
+    if gp.kernel.batch_shape != gp.batch_shape:
+        raise ValueError(
+            "each learner fits its own parameters, so the kernel's batch_shape "
+            f"{tuple(gp.kernel.batch_shape)} must be that of the process, {tuple(gp.batch_shape)}"
+        )
     if evidence not in ("data", "stream"):
         raise ValueError(f"evidence must be 'data' or 'stream', got {evidence!r}")
     parameters: list[nn.Parameter] = list(gp.kernel.parameters())
@@ -72,8 +79,16 @@ def fit_hyperparameters(
         parameters.append(gp.log_noise_variance)
     before = [parameter.detach().clone() for parameter in parameters]
     density = _predictive_density(predict, gp, *judges)
-    _ascend(lambda: objective() + gp.kernel.log_prior(), parameters, steps, learning_rate, gp, noise_floor)
-    accept = _predictive_density(predict, gp, *judges) >= density
+    try:
+        _ascend(
+            lambda: objective() + gp.kernel.log_prior(), parameters, steps, learning_rate, gp, noise_floor
+        )
+        accept = _predictive_density(predict, gp, *judges) >= density
+    except CholeskyError as error:
+        warnings.warn(
+            f"the fit ran into parameters without a posterior and was undone: {error}", stacklevel=2
+        )
+        accept = torch.zeros_like(density, dtype=torch.bool)
     with torch.no_grad():
         for parameter, old in zip(parameters, before, strict=True):
             keep = accept.reshape(accept.shape + (1,) * (parameter.ndim - accept.ndim))

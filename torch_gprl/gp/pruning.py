@@ -95,8 +95,8 @@ def keep_first(
     `"dtc"` conditions them at their prior mean given the kept ones, Csató's toolbox form, overconfident.
 
     Returns:
-        the state [*batch, kept, ...] and the change of the log evidence's constant, such that the evidence
-        stays what it was, [*batch].
+        the state [*batch, kept, ...] and the change of the log evidence's constant [*batch]: with `"moment"`
+        such that the evidence stays what it was, with `"dtc"` none.
     """
     index = order.unsqueeze(-1).expand_as(state.gram_factor)
     orthogonal, upper = torch.linalg.qr(state.gram_factor.gather(-2, index).mT)  # P L = Rᵀ Qᵀ

@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torch_gprl.gp.door import admit_data
 from torch_gprl.gp.pruning import InformationScore, PruningScore, Whitened, basis_statistics, keep_first
@@ -164,9 +165,10 @@ class SparseOnlineGP(WhitenedState):
         # moment: W = 1/(σ0² + ν); dtc ignores what the basis misses
         variance = noise + novelty if self.projection == "moment" else noise.expand_as(novelty)
         self._accumulate(phi, variance, block.targets, block.mask)
-        room = min(self.overshoot, _churn(block.inputs.shape[-2]))  # for the additions of the next block
-        if bool((self.size > self.capacity - room).any()):
-            self._prune()
+        room = self._churn(block.mask, block.inputs.shape[-2])  # for the additions of the next block
+        full = self.size > self.capacity - room
+        if bool(full.any()):
+            self._prune(full)
 
     def _accumulate(self, phi: Tensor, variance: Tensor, targets: Tensor, mask: Tensor | None) -> None:
         """A += Φ W Φᵀ, b += Φ W y, and the constant of the evidence, with W = 1/variance."""
@@ -197,7 +199,7 @@ class SparseOnlineGP(WhitenedState):
         if not bool(candidate.any()):
             return phi, novelty
         # free growth up to the budget, then the churn, never past the buffers
-        wanted = (self.budget - self.size).clamp_min(0) + _churn(inputs.shape[-2])
+        wanted = (self.budget - self.size).clamp_min(0) + self._churn(mask, inputs.shape[-2])
         limit = torch.minimum(wanted, self.capacity - self.size)
         residual = self.kernel(inputs, inputs) - phi.mT @ phi
         open_to = novelty if mask is None else novelty.where(mask, -torch.inf)
@@ -244,15 +246,23 @@ class SparseOnlineGP(WhitenedState):
         self, phi: Tensor, inputs: Tensor, following: GaussianInputs, discount: Tensor
     ) -> tuple[Tensor, Tensor]:
         """φ and novelty of f(x) − γ f(x'), from φ of x."""
-        difference = phi - discount.unsqueeze(-2) * self._averaged_features(following)
+        averaged = self._averaged_features(following)
+        # the picks of small learners may have left rows of φ that no learner uses
+        difference = phi[..., : averaged.shape[-2], :] - discount.unsqueeze(-2) * averaged
         shared = self.kernel.expected_pairs(following, GaussianInputs.exactly(inputs))
         own = self._prior_variance(following)
         # Var[f(x) − γ f(x')] = k(x, x) − 2γ k(x, x') + γ² k(x', x')
         prior = self.kernel.diag(inputs) - 2 * discount * shared + discount.square() * own
         return difference, prior - torch.linalg.vecdot(difference, difference, dim=-2)
 
-    def _prune(self) -> None:
-        """Delete the lowest scores until every learner is back at its budget."""
+    def _churn(self, mask: Tensor | None, points: int) -> Tensor | int:
+        """Most additions to a full basis from one block, for each learner."""
+        if mask is None:
+            return min(-(-points // CHURN), self.overshoot)
+        return (-(-mask.sum(-1) // CHURN)).clamp_max(self.overshoot)
+
+    def _prune(self, full: Tensor) -> None:
+        """Delete the lowest scores of the learners that are `full` until they are back at their budget."""
         self.refresh()
         rows, kept = self._active().rows, slice(self.budget)
         score = self.pruning(basis_statistics(self, rows)).masked_fill(~self.mask[..., :rows], -torch.inf)
@@ -264,20 +274,27 @@ class SparseOnlineGP(WhitenedState):
         )
         left, evidence = keep_first(state, order, self.budget, self.projection)
         wide = order[..., kept].unsqueeze(-1).expand(*order.shape[:-1], self.budget, self.basis.shape[-1])
-        basis, stamps = self.basis.gather(-2, wide), self.stamps.gather(-1, order[..., kept])
-        self._clear()
-        self.basis[..., kept, :] = basis
-        self.stamps[..., kept] = stamps
-        self.gram_factor[..., kept, kept] = left.gram_factor
-        self.precision[..., kept, kept] = left.precision
-        self.information[..., kept] = left.information
-        self.evidence_constant.add_(evidence)
-        self.size.clamp_(max=self.budget)
+        unused = self.capacity - self.budget
+        pruned = {
+            "basis": pad(self.basis.gather(-2, wide), (0, 0, 0, unused)),
+            "stamps": pad(self.stamps.gather(-1, order[..., kept]), (0, unused)),
+            "gram_factor": _bordered(left.gram_factor, unused),
+            "precision": _bordered(left.precision, unused),
+            "information": pad(left.information, (0, unused)),
+            "evidence_constant": self.evidence_constant + evidence,
+            "size": self.size.clamp_max(self.budget),
+        }
+        for name, new in pruned.items():
+            old = self.get_buffer(name)
+            old.copy_(new.where(full.reshape(full.shape + (1,) * (old.ndim - full.ndim)), old))
         self._stale = True
 
     @torch.no_grad()
     def merge(self, other: "SparseOnlineGP") -> None:
         """Add what `other`, a GP with the same kernel and the same basis, has learned: A += A' − I, b += b'.
+
+        What both have learned counts twice. To share out data, give every part the basis and `forget` there
+        what it was made from.
 
         Raises:
             ValueError: the two bases differ.
@@ -285,8 +302,8 @@ class SparseOnlineGP(WhitenedState):
         if not (torch.equal(self.size, other.size) and torch.equal(self.basis, other.basis)):
             raise ValueError(
                 f"merge needs one basis shared by both, got sizes {self.size.tolist()} and "
-                f"{other.size.tolist()} with different vectors; start both from the same basis "
-                "(load_state_dict), then update each"
+                f"{other.size.tolist()} with different vectors; start from one basis (load_state_dict, then "
+                "forget in all but one), and learn without adding to it"
             )
         self.precision.add_(other.precision)
         self.precision.diagonal(dim1=-2, dim2=-1).sub_(1)
@@ -298,25 +315,29 @@ class SparseOnlineGP(WhitenedState):
     @torch.no_grad()
     def reset(self) -> None:
         """Forget all data and the basis; the kernel's parameters and the noise stay."""
-        self._clear()
-        for counter in (self.size, self.clock, self.observations, self.evidence_constant):
-            counter.zero_()
+        self.forget()
+        self.gram_factor.copy_(torch.eye(self.capacity, dtype=self.basis.dtype, device=self.basis.device))
+        for other in (self.basis, self.stamps, self.size, self.clock):
+            other.zero_()
         self._accept_state()
 
-    def _clear(self) -> None:
-        for matrix in (self.gram_factor, self.precision):
-            matrix.zero_()
-            matrix.diagonal(dim1=-2, dim2=-1).fill_(1)
-        for other in (self.basis, self.information, self.stamps):
+    @torch.no_grad()
+    def forget(self) -> None:
+        """Forget all data but keep the basis: the prior again, ready for other data or other targets."""
+        self.precision.copy_(torch.eye(self.capacity, dtype=self.basis.dtype, device=self.basis.device))
+        for other in (self.information, self.evidence_constant, self.observations):
             other.zero_()
+        self._stale = True
 
 
 LOG_TWO_PI = math.log(2 * math.pi)
 
 
-def _churn(points: int) -> int:
-    """Most additions to a full basis from one block."""
-    return -(-points // CHURN)
+def _bordered(matrix: Tensor, rows: int) -> Tensor:
+    """The matrix with `rows` rows and columns of an identity behind it."""
+    bordered = pad(matrix, (0, rows, 0, rows))
+    bordered.diagonal(dim1=-2, dim2=-1)[..., matrix.shape[-1] :] = 1
+    return bordered
 
 
 def _check_options(

@@ -133,6 +133,9 @@ class WhitenedState(nn.Module):
     def posterior(self, inputs: Float[Tensor, "*#batch N D"] | GaussianInputs) -> Posterior:
         """Mean and variance of f (without noise) at `inputs`, [*batch, N] each; differentiable in them.
 
+        The gradient in the kernel's parameters is not the whole one: the basis' Gram factor counts as a
+        constant. To fit parameters take `log_marginal_likelihood`.
+
         For `GaussianInputs` those of the average of f over the Gaussian columns, in closed form.
         """
         self.refresh()
@@ -225,7 +228,7 @@ class WhitenedState(nn.Module):
         return self
 
     def _kernel_versions(self) -> tuple[int, ...]:
-        return tuple(parameter._version for parameter in self._kernel_parameters)
+        return id(self.kernel), *(parameter._version for parameter in self._kernel_parameters)
 
     def _state_versions(self) -> tuple[int, ...]:
         return self.precision._version, self.information._version, id(self.precision)

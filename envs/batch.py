@@ -6,6 +6,7 @@ can be bootstrapped at time limits.
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from tensordict import TensorDict, TensorDictBase
@@ -184,3 +185,11 @@ class BatchEnv(EnvBase):
     ) -> UInt8[Tensor, "H W 3"]:
         """A picture of one environment's present state."""
         return torch.from_numpy(self._pictures.frame(self.qpos[learner, env].numpy(), width, height))
+
+    def render_all(self, width: int = 160, height: int = 160) -> UInt8[Tensor, "learners num_envs H W 3"]:
+        """Pictures of all environments, for TorchRL's video recorder.
+
+        Use `PixelRenderTransform(render_method="render_all")` before `VideoRecorder`, which tiles them.
+        """
+        frames = [self.render(learner, env, width, height) for learner, env in np.ndindex(self._shape)]
+        return torch.stack(frames).unflatten(0, self._shape)

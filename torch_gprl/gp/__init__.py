@@ -3,11 +3,12 @@
 from torch_gprl.gp.evidence import fit_hyperparameters
 from torch_gprl.gp.exact import ExactGP
 from torch_gprl.gp.posterior import Posterior
-from torch_gprl.gp.pruning import BasisStatistics, InformationScore, PruningScore
+from torch_gprl.gp.pruning import AgeAwareScore, BasisStatistics, InformationScore, PruningScore
 from torch_gprl.gp.recursion import RecursiveGP
 from torch_gprl.gp.sparse_online import SparseOnlineGP
 
 __all__ = [
+    "AgeAwareScore",
     "BasisStatistics",
     "ExactGP",
     "InformationScore",

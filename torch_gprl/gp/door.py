@@ -22,10 +22,12 @@ def admit_inputs(inputs: Tensor, batch_shape: torch.Size, like: Tensor) -> Tenso
     return inputs.to(like.dtype).expand(*batch_shape, *inputs.shape[-2:])
 
 
-def admit_points(points: Tensor | GaussianInputs, batch_shape: torch.Size, like: Tensor) -> GaussianInputs:
+def admit_points(
+    points: Tensor | GaussianInputs, batch_shape: torch.Size, like: Tensor
+) -> Tensor | GaussianInputs:
     """Points where f, or its average over Gaussian columns, is asked for; see `admit_inputs`."""
     if not isinstance(points, GaussianInputs):
-        return GaussianInputs.exactly(admit_inputs(points, batch_shape, like))
+        return admit_inputs(points, batch_shape, like)
     mean = admit_inputs(points.mean, batch_shape, like)
     return GaussianInputs(mean, points.variance.to(like.dtype).expand(*mean.shape[:-1], -1), points.columns)
 

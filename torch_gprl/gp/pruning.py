@@ -77,6 +77,70 @@ class InformationScore:
         return f"InformationScore({self.kind!r})"
 
 
+class AgeAwareScore:
+    """Information and age together, the thesis' equations (.13) and (.14): old and useless vectors go first.
+
+    The score is (1 − λ) ε / mean(ε) + λ g(t) with the information score ε and the stamp t, the policy update
+    that added the vector. g is bounded and finite, unlike the printed forms, which overflow or are infinite:
+
+        exponential   g = exp((t − t_max) / timescale), in (0, 1]
+        logit         g = ½ + logit(u) / (2 logit(0.99)), u = 0.01 + 0.98 (t − t_min) / (t_max − t_min)
+
+    λ = 0 is the information score, λ = 1 first in, first out; equal stamps make age irrelevant.
+
+    Args:
+        age_weight: λ, from 0 to 1.
+        form: of g.
+        timescale: policy updates after which the exponential form has fallen to 1/e; beyond 700 of them ages
+            count as equal.
+        base: score of the information.
+
+    Raises:
+        ValueError: a weight outside [0, 1], another form, or a timescale that is not positive.
+    """
+
+    def __init__(
+        self,
+        age_weight: float,
+        form: Literal["exponential", "logit"] = "exponential",
+        timescale: float = 10.0,
+        base: PruningScore | None = None,
+    ) -> None:
+        if not 0 <= age_weight <= 1:
+            raise ValueError(f"age_weight must lie between 0 and 1, got {age_weight}")
+        if form not in ("exponential", "logit"):
+            raise ValueError(f"form must be 'exponential' or 'logit', got {form!r}")
+        if not timescale > 0:
+            raise ValueError(f"timescale must be positive (policy updates), got {timescale}")
+        self.age_weight, self.form, self.timescale = age_weight, form, timescale
+        self.base = InformationScore() if base is None else base
+
+    def __call__(self, statistics: BasisStatistics) -> Float[Tensor, "*batch B"]:
+        """Score each basis vector [*batch, B]."""
+        information = torch.where(statistics.mask, self.base(statistics), 0.0)
+        mean = information.sum(-1, keepdim=True) / statistics.mask.sum(-1, keepdim=True).clamp_min(1)
+        tiny = torch.finfo(mean.dtype).tiny  # a process that has learned nothing yet has no information
+        relative = information / mean.clamp_min(tiny)
+        return (1 - self.age_weight) * relative + self.age_weight * self.recency(statistics)
+
+    def recency(self, statistics: BasisStatistics) -> Float[Tensor, "*batch B"]:
+        """g(t) of each basis vector [*batch, B]: 1 for the newest."""
+        stamps, mask = statistics.stamps, statistics.mask
+        newest = stamps.masked_fill(~mask, torch.iinfo(stamps.dtype).min).amax(-1, keepdim=True)
+        age = (newest - stamps).where(mask, 0).to(statistics.alpha.dtype)
+        if self.form == "exponential":
+            return torch.exp(-age / self.timescale)
+        fresh = 1 - age / age.amax(-1, keepdim=True).clamp_min(1)  # (t − t_min)/(t_max − t_min)
+        edge = torch.full_like(fresh, LOGIT_EDGE)
+        return 0.5 + torch.logit(edge + (1 - 2 * edge) * fresh) / (2 * torch.logit(1 - edge))
+
+    def __repr__(self) -> str:
+        return f"AgeAwareScore({self.age_weight}, {self.form!r}, {self.timescale}, {self.base!r})"
+
+
+LOGIT_EDGE = 0.01  # how near to 0 and 1 the logit form comes
+
+
 class Whitened(NamedTuple):
     """The state of a sparse GP that a deletion rewrites; see the module's table."""
 

@@ -246,7 +246,7 @@ class SparseOnlineGP(WhitenedState):
         self, phi: Tensor, inputs: Tensor, following: GaussianInputs, discount: Tensor
     ) -> tuple[Tensor, Tensor]:
         """φ and novelty of f(x) − γ f(x'), from φ of x."""
-        averaged = self._averaged_features(following)
+        averaged = self._features(following)
         # the picks of small learners may have left rows of φ that no learner uses
         difference = phi[..., : averaged.shape[-2], :] - discount.unsqueeze(-2) * averaged
         shared = self.kernel.expected_pairs(following, GaussianInputs.exactly(inputs))

@@ -19,7 +19,8 @@ parameters, have changed.
 
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -40,6 +41,7 @@ class Active(NamedTuple):
 
     rows: int
     basis: Float[Tensor, "*batch R D"]
+    cross: Callable[[Tensor], Tensor]  # x ↦ k(X_B, x)
     gram_factor: Float[Tensor, "*batch R R"]
     mask: Bool[Tensor, "*batch R 1"] | None  # which of them are a learner's own; None if all are
 
@@ -139,17 +141,17 @@ class WhitenedState(nn.Module):
         For `GaussianInputs` those of the average of f over the Gaussian columns, in closed form.
         """
         self.refresh()
-        points = admit_points(inputs, self.batch_shape, self.basis)
-        phi, half = self._project(points)
+        inputs = admit_points(inputs, self.batch_shape, self.basis)
+        phi, half = self._project(inputs)
         mean = (self.weights[..., None, : phi.shape[-2]] @ phi).squeeze(-2)
         # k** − φᵀφ + φᵀA⁻¹φ
-        return Posterior(mean, self._prior_variance(points) - _square(phi) + _square(half))
+        return Posterior(mean, self._prior_variance(inputs) - _square(phi) + _square(half))
 
     def mean(self, inputs: Float[Tensor, "*#batch N D"] | GaussianInputs) -> Float[Tensor, "*batch N"]:
         """Posterior mean alone [*batch, N], several times cheaper than `posterior`."""
-        points = admit_points(inputs, self.batch_shape, self.basis)
+        inputs = admit_points(inputs, self.batch_shape, self.basis)
         alpha, active = self.alpha, self._active()
-        return (self.kernel.expected(points, active.basis) @ alpha[..., : active.rows, None]).squeeze(-1)
+        return (alpha[..., None, : active.rows] @ self._cross(inputs, active)).squeeze(-2)
 
     def forward(
         self, inputs: Float[Tensor, "*#batch N D"]
@@ -162,7 +164,7 @@ class WhitenedState(nn.Module):
         """Joint posterior of f at `inputs`, for sampling whole functions."""
         self.refresh()
         inputs = admit_inputs(inputs, self.batch_shape, self.basis)
-        phi, half = self._project(GaussianInputs.exactly(inputs))
+        phi, half = self._project(inputs)
         covariance = self.kernel(inputs, inputs) - phi.mT @ phi + half.mT @ half
         mean = (self.weights[..., None, : phi.shape[-2]] @ phi).squeeze(-2)
         factor = cholesky(covariance)
@@ -227,6 +229,9 @@ class WhitenedState(nn.Module):
         self._accept_state()
         return self
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_active_seen": (), "_active_rows": None}
+
     def _kernel_versions(self) -> tuple[int, ...]:
         return id(self.kernel), *(parameter._version for parameter in self._kernel_parameters)
 
@@ -236,41 +241,44 @@ class WhitenedState(nn.Module):
     def _active(self) -> Active:
         """The rows in use. On a GPU all rows: asking how many are used would wait for the device."""
         if torch.compiler.is_compiling() or self.size.device.type != "cpu":
-            return Active(self.capacity, self.basis, self.gram_factor, self.mask.unsqueeze(-1))
+            cross = partial(self.kernel, self.basis)
+            return Active(self.capacity, self.basis, cross, self.gram_factor, self.mask.unsqueeze(-1))
         seen = self.basis._version, self.gram_factor._version, id(self.basis)
         if seen != self._active_seen:
             sizes = self.size.flatten().tolist()
             rows = max(sizes, default=0)
             mask = None if min(sizes, default=0) == rows else self.mask[..., :rows].unsqueeze(-1)
-            factor = self.gram_factor[..., :rows, :rows].contiguous()
-            self._active_rows = Active(rows, self.basis[..., :rows, :].contiguous(), factor, mask)
+            factor, basis = (
+                self.gram_factor[..., :rows, :rows].contiguous(),
+                self.basis[..., :rows, :].contiguous(),
+            )
+            self._active_rows = Active(rows, basis, self.kernel.against(basis), factor, mask)
             self._active_seen = seen
         return self._active_rows
 
     # ---------------------------------------------------------------- inside
 
-    def _features(self, inputs: Tensor) -> Float[Tensor, "*batch R N"]:
+    def _cross(self, inputs: Tensor | GaussianInputs, active: Active) -> Float[Tensor, "*batch R N"]:
+        """Covariance of f, or of its average over Gaussian columns, with the basis values."""
+        if isinstance(inputs, GaussianInputs):
+            return self.kernel.expected(inputs, active.basis).mT
+        return active.cross(inputs)
+
+    def _features(self, inputs: Tensor | GaussianInputs) -> Float[Tensor, "*batch R N"]:
         """φ = L⁻¹ k(X_B, x) in columns, for the rows in use."""
         active = self._active()
-        return self._whitened(self.kernel(active.basis, inputs), active)
-
-    def _whitened(self, cross: Tensor, active: Active) -> Tensor:
+        cross = self._cross(inputs, active)
         return _solve(active.gram_factor, cross if active.mask is None else cross * active.mask)
 
-    def _averaged_features(self, points: GaussianInputs) -> Float[Tensor, "*batch R N"]:
-        """E[φ(x)] over the Gaussian columns of x."""
-        if not points.columns:
-            return self._features(points.mean)
-        active = self._active()
-        return self._whitened(self.kernel.expected(points, active.basis).mT, active)
+    def _prior_variance(self, inputs: Tensor | GaussianInputs) -> Float[Tensor, "*batch N"]:
+        """Prior variance of f, or of its average over Gaussian columns, at each point."""
+        if isinstance(inputs, GaussianInputs):
+            return self.kernel.expected_pairs(inputs, inputs)
+        return self.kernel.diag(inputs)
 
-    def _prior_variance(self, points: GaussianInputs) -> Float[Tensor, "*batch N"]:
-        """Prior variance of f, averaged over the Gaussian columns, at each point."""
-        return self.kernel.expected_pairs(points, points) if points.columns else self.kernel.diag(points.mean)
-
-    def _project(self, points: GaussianInputs) -> tuple[Tensor, Tensor]:
+    def _project(self, inputs: Tensor | GaussianInputs) -> tuple[Tensor, Tensor]:
         """φ and R⁻¹φ with A = RRᵀ: what the basis explains of x, and what the data left open of that."""
-        phi = self._averaged_features(points)
+        phi = self._features(inputs)
         rows = phi.shape[-2]
         return phi, _solve(self.precision_factor[..., :rows, :rows], phi)
 

@@ -5,8 +5,8 @@ covariance function with positive parameters, batched over independent learners.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from functools import reduce
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
 from operator import add, mul
 
 import torch
@@ -42,6 +42,14 @@ class Kernel(nn.Module, ABC):
     @abstractmethod
     def diag(self, x: Inputs) -> PerPoint:
         """Prior variance k(x, x) of every row of x [*batch, N, D]: [*batch, N]."""
+
+    def against(self, z: OtherInputs) -> Callable[[Inputs], CrossMatrix]:
+        """The function x ↦ k(z, x) [*batch, M, N], for one z and many x.
+
+        Kernels may compute beforehand what depends on z alone. The parameters are those of now, and neither
+        they nor z need get a gradient; x does.
+        """
+        return partial(self, z)
 
     @property
     def active_columns(self) -> frozenset[int]:

@@ -6,6 +6,7 @@ error is a few machine epsilons of the squared distance to the centre, not of th
 """
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs
@@ -42,6 +43,34 @@ def log_gaussian(
         diagonal = exponent.diagonal(dim1=-2, dim2=-1)
         diagonal.copy_(torch.zeros_like(diagonal) if offset is None else offset.squeeze(-1))
     return exponent
+
+
+class GaussianBumps:
+    """x ↦ σ² exp(−½ Σ_d (z_d − x_d)²/ℓ_d²) [*batch, M, N] for one z [*batch, M, D], prepared beforehand.
+
+    Args:
+        z: points [*batch, M, D], at least one.
+        log_lengthscale: log ℓ [*batch, D].
+        log_outputscale: log σ² [*batch].
+    """
+
+    def __init__(self, z: OtherInputs, log_lengthscale: Tensor, log_outputscale: Tensor) -> None:
+        with torch.no_grad():
+            self.inverse = log_lengthscale.neg().exp_().unsqueeze(-2)
+            self.centre = z[..., :1, :].to(log_lengthscale.dtype)
+            self.points = (z - self.centre) * self.inverse
+            square = torch.linalg.vecdot(self.points, self.points).unsqueeze(-1)
+            self.peak = torch.sub(log_outputscale[..., None, None], square, alpha=0.5)  # log σ² − ½|z|²/ℓ²
+
+    def __call__(self, x: Inputs) -> Float[Tensor, "... M N"]:
+        """Covariances with x [*batch, N, D]."""
+        x = (x.to(self.peak.dtype) - self.centre) * self.inverse
+        square = torch.linalg.vecdot(x, x).unsqueeze(-2)
+        if x.ndim == 2 and self.points.ndim == 2:
+            exponent = torch.addmm(self.peak, self.points, x.mT)
+        else:
+            exponent = self.peak + self.points @ x.mT
+        return exponent.sub_(square, alpha=0.5).exp_()
 
 
 def _by_differences(x: Tensor, z: Tensor, log_lengthscale: Tensor, offset: Tensor | None) -> Tensor:

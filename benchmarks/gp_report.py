@@ -40,11 +40,11 @@ def print_tables(results: dict[str, Any], console: Console) -> None:
     console.print(
         f"{machine['date']}, {machine['processor']}, {machine['threads']} thread, load {machine['load']:.1f}"
     )
-    console.print(_streams_table(results["streams"]))
+    console.print(_streams_table(results["streams"], results["setting"]))
     for variable in VARIABLES:
         console.print(_growth_table(variable, results[variable]))
     console.print(_plain_table("A settled basis beside the machine's matrix product", results["settled"]))
-    console.print(_plain_table("Points/s over all learners, budget 100", results["learners"]))
+    console.print(_plain_table("Points/s over all learners", results["learners"]))
     console.print(_prediction_table(results["prediction"]))
 
 
@@ -70,6 +70,7 @@ def draw(results: dict[str, Any], path: Path) -> None:
         axis.set(xlabel=VARIABLES[variable], ylabel="updates/s", title=f"Every point novel, by {variable}")
         axis.grid(alpha=0.3)
     _draw_learners(axes[1, 1], results["learners"])
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(PEERS))
     machine = results["machine"]
     figure.suptitle(f"{machine['processor']}, one thread, float64, {machine['date']}", fontsize=9)
     figure.savefig(path, dpi=110)
@@ -84,8 +85,7 @@ def _draw_streams(axis: Axes, rows: Rows) -> None:
         axis.barh(places, [row["updates_per_second"] for row in own], height, label=peer)
     axis.set_yticks([place + 0.4 - height / 2 for place in range(len(streams))], streams)
     axis.invert_yaxis()
-    axis.set(xscale="log", xlabel="updates/s", title="Budget 200, blocks of 32")
-    axis.legend(fontsize=7)
+    axis.set(xscale="log", xlabel="updates/s", title="By stream")
 
 
 def _draw_learners(axis: Axes, rows: Rows) -> None:
@@ -99,8 +99,8 @@ def _draw_learners(axis: Axes, rows: Rows) -> None:
     axis.legend(fontsize=7)
 
 
-def _streams_table(rows: Rows) -> Table:
-    title = "Budget 200, blocks of 32: speed, ours / theirs, and accuracy after the same points"
+def _streams_table(rows: Rows, setting: dict[str, int]) -> Table:
+    title = f"Budget {setting['budget']}, blocks of {setting['block']}; ratio: ours / theirs"
     table = _table(title, ("stream", "peer", "updates/s", "ratio", "RMSE", "NLPD"))
     for row in rows:
         ratio = "" if row["peer"] == OURS else f"{row['ratio']:.1f}"
@@ -123,7 +123,7 @@ def _growth_table(variable: str, rows: Rows) -> Table:
 
 def _prediction_table(rows: Rows) -> Table:
     counts = sorted({row["points"] for row in rows})
-    table = _table("Mean and variance, budget 200, in ms", ("peer", *(f"{count} points" for count in counts)))
+    table = _table("Mean and variance, in ms", ("peer", *(f"{count} points" for count in counts)))
     for peer, own in by_peer(rows).items():
         table.add_row(peer, *(f"{1e3 * row['seconds']:.3f}" for row in own))
     return table

@@ -41,7 +41,14 @@ class Effort:
     blocks: tuple[int, ...] = (1, 8, 32, 128, 1000)
     dims: tuple[int, ...] = (3, 8, 16, 23)
     learners: tuple[int, ...] = (1, 4, 16, 64)
-    settled: tuple[tuple[int, int], ...] = ((50, 256), (200, 32), (200, 256), (200, 1000), (1000, 1000))
+    settled: tuple[tuple[int, int], ...] = (
+        (200, 1),
+        (200, 32),
+        (200, 256),
+        (200, 1000),
+        (50, 1000),
+        (1000, 1000),
+    )
 
 
 QUICK = Effort(
@@ -51,10 +58,10 @@ QUICK = Effort(
     common=800,
     patience=2.0,
     budgets=(50, 200),
-    blocks=(1, 32, 1000),
+    blocks=(1, 32, 256),
     dims=(3, 23),
     learners=(1, 64),
-    settled=((200, 32), (200, 1000)),
+    settled=((200, 1), (200, 32), (200, 1000)),
 )
 
 
@@ -228,7 +235,8 @@ def measure(effort: Effort, console: Console) -> dict[str, object]:
         "learners": (measure_learners(effort), 3 * len(effort.learners)),
         "prediction": (measure_prediction(effort), 2 * len(PEERS)),
     }
-    results: dict[str, object] = {"machine": machine(), "effort": asdict(effort)}
+    setting = {"budget": BUDGET, "block": BLOCK, "learner_budget": LEARNER_BUDGET}
+    results: dict[str, object] = {"machine": machine(), "effort": asdict(effort), "setting": setting}
     columns = (TextColumn("{task.description:<12}"), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as progress:
         for name, (rows, total) in sections.items():

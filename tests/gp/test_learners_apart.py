@@ -94,3 +94,14 @@ def test_evidence_of_the_stream_finds_a_kernel_that_predicts_better() -> None:
     assert gp.log_marginal_likelihood().item() > before
     assert bool((gp.kernel.lengthscale > 0.6).all())  # the function varies over a length of about 1.4
     assert (gp.posterior(inputs[300:]).mean - targets[300:]).square().mean() < error
+
+
+@pytest.mark.parametrize("length", [1, 7, 32, 256])
+def test_a_full_basis_admits_one_in_32_points_however_the_stream_is_cut(length: int) -> None:
+    gp = SparseOnlineGP(SquaredExponential(3, 0.2), 20, 1e-3, overshoot=20)
+    gp.update(3 * torch.rand(64, 3, dtype=F64), torch.randn(64, dtype=F64))  # all novel
+    before = int(gp.size)
+    assert before >= 20
+    for block in (3 * torch.rand(256, 3, dtype=F64)).split(length):
+        gp.update(block, torch.randn(len(block), dtype=F64))
+    assert int(gp.size) == before + 256 // 32

@@ -179,7 +179,7 @@ def test_the_lowest_scores_go_and_stamps_stay_with_their_vectors():
         return worth[statistics.stamps]
 
     inputs, targets = sample(ALL + 1)
-    gp = SparseOnlineGP(KERNEL, 8, NOISE, 0.0, overshoot=5, pruning=by_stamp)
+    gp = SparseOnlineGP(KERNEL, 8, NOISE, 0.0, overshoot=5, pruning=by_stamp, order="arrival")
     for stamp in range(ALL + 1):
         assert gp.size == stamp
         gp.update(inputs[stamp : stamp + 1], targets[stamp : stamp + 1], stamp=stamp)
@@ -192,7 +192,7 @@ def test_the_lowest_scores_go_and_stamps_stay_with_their_vectors():
 
 @pytest.mark.parametrize("target", [-3.0, 0.0, 2.0])
 def test_each_target_adds_its_log_predictive_density_to_the_evidence_also_when_it_prunes(target):
-    gp = SparseOnlineGP(KERNEL, 6, NOISE, 0.0, overshoot=1).requires_grad_(False)
+    gp = SparseOnlineGP(KERNEL, 6, NOISE, 0.0, overshoot=1, order="arrival").requires_grad_(False)
     gp.update(*sample(30))
     new, before = sample(1)[0], gp.log_marginal_likelihood()
     prediction = gp.posterior(new).predictive(NOISE)

@@ -84,7 +84,7 @@ class AgeAwareScore:
     that added the vector. g is bounded and finite, unlike the printed forms, which overflow or are infinite:
 
         exponential   g = exp((t − t_max) / timescale), in (0, 1]
-        logit         g = ½ + logit(u) / (2 logit(0.99)), u = 0.01 + 0.98 (t − t_min) / (t_max − t_min)
+        logit         g = ½ − logit(u) / (2 logit(0.01)), u = 0.01 + 0.98 (t − t_min) / (t_max − t_min)
 
     λ = 0 is the information score, λ = 1 first in, first out; equal stamps make age irrelevant.
 
@@ -132,7 +132,7 @@ class AgeAwareScore:
             return torch.exp(-age / self.timescale)
         fresh = 1 - age / age.amax(-1, keepdim=True).clamp_min(1)  # (t − t_min)/(t_max − t_min)
         edge = torch.full_like(fresh, LOGIT_EDGE)
-        return 0.5 + torch.logit(edge + (1 - 2 * edge) * fresh) / (2 * torch.logit(1 - edge))
+        return 0.5 - torch.logit(edge + (1 - 2 * edge) * fresh) / (2 * torch.logit(edge))
 
     def __repr__(self) -> str:
         return f"AgeAwareScore({self.age_weight}, {self.form!r}, {self.timescale}, {self.base!r})"

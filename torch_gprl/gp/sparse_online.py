@@ -17,12 +17,12 @@ from torch.nn.functional import pad
 from torch_gprl.gp.door import admit_data
 from torch_gprl.gp.pruning import InformationScore, PruningScore, Whitened, basis_statistics, keep_first
 from torch_gprl.gp.selection import Selection, select_novel
-from torch_gprl.gp.whitened import NOVELTY_FLOOR, WhitenedState
+from torch_gprl.gp.whitened import NOVELTY_FLOOR, WhitenedState, solve_triangular
 from torch_gprl.kernels.base import Kernel
 from torch_gprl.kernels.gaussian_inputs import GaussianInputs
 
 BLOCK = 256  # points absorbed at once; longer updates are cut into blocks of this size
-# A full basis admits at most one in so many points of a block, since every swap projects the past. Of 4, 8,
+# A full basis admits at most one in so many points of a stream, since every swap projects the past. Of 4, 8,
 # 16, 32 and 64, on streams of 12,800 points, 32 predicted best or within 2 % of it, and 4 worst.
 CHURN = 32
 
@@ -67,8 +67,9 @@ class SparseOnlineGP(WhitenedState):
         pruning: score of the basis vectors, the smallest go; `InformationScore()` unless told.
         projection: `"moment"` keeps the posterior of the basis values exact when a point is projected or a
             vector deleted (FITC); `"dtc"` is the overconfident form of Csató's toolbox.
-        order: `"novelty"` picks new basis vectors from a block by largest novelty; `"arrival"` takes the
-            points one by one, as the textbook recursion does.
+        order: `"novelty"` picks new basis vectors from a block by largest novelty, and lets a full basis
+            admit one in `CHURN` points of the stream; `"arrival"` takes the points one by one and admits
+            every novel one, as the textbook recursion does.
         overshoot: vectors above the budget that may gather before a round of pruning takes them at once;
             min(budget / 4, 64) unless told. 1 prunes after every addition.
 
@@ -133,9 +134,14 @@ class SparseOnlineGP(WhitenedState):
             self.clock.fill_(stamp)
         if self._kernel_versions() != self._kernel_seen:
             self.rebase()
+        points, noise = inputs.shape[-2], self.noise_variance.unsqueeze(-1)
         block = 1 if self.order == "arrival" else BLOCK
-        noise = self.noise_variance.unsqueeze(-1)
-        for start in range(0, inputs.shape[-2], block):
+        plain = mask is None and next_inputs is None and inputs.ndim == 2 and inputs.device.type == "cpu"
+        if plain and min(points, block) == 1:
+            for point, target in zip(inputs.split(1), targets.tolist(), strict=True):
+                self._absorb_point(point, target, float(noise))
+            return
+        for start in range(0, points, block):
             self._absorb_block(observed.block(start, start + block), noise)
 
     def _observed(
@@ -165,10 +171,31 @@ class SparseOnlineGP(WhitenedState):
         # moment: W = 1/(σ0² + ν); dtc ignores what the basis misses
         variance = noise + novelty if self.projection == "moment" else noise.expand_as(novelty)
         self._accumulate(phi, variance, block.targets, block.mask)
-        room = self._churn(block.mask, block.inputs.shape[-2])  # for the additions of the next block
+        room = min(self.overshoot, -(-block.inputs.shape[-2] // CHURN))  # for the additions of a next block
         full = self.size > self.capacity - room
         if bool(full.any()):
             self._prune(full)
+
+    def _absorb_point(self, point: Tensor, target: float, noise: float) -> None:
+        """`_absorb_block` for one point of one learner on the CPU, with host numbers: three times as fast."""
+        active = self._active()
+        phi = solve_triangular(active.gram_factor, active.cross(point))
+        prior = float(self.kernel.diag(point))
+        novelty, rows = prior - float(phi.mT @ phi), active.rows
+        floor = NOVELTY_FLOOR[phi.dtype] * prior
+        admitted = rows < self.budget or self.order == "arrival" or (int(self.observations) + 1) % CHURN == 0
+        if admitted and novelty > max(self.novelty_threshold * noise, floor):
+            phi = torch.cat([phi, phi.new_full((1, 1), math.sqrt(novelty))])
+            self._write_rows(phi.mT, point, rows)
+            novelty, rows = 0.0, rows + 1
+        weight = 1 / (noise + novelty) if self.projection == "moment" else 1 / noise
+        self.precision[:rows, :rows].addmm_(phi, phi.mT, alpha=weight)
+        self.information[:rows].add_(phi[:, 0], alpha=weight * target)
+        self.evidence_constant.add_(0.5 * (math.log(weight) - weight * target**2 - LOG_TWO_PI))
+        self.observations.add_(1)
+        self._stale = True
+        if rows == self.capacity:
+            self._prune(self.size == rows)
 
     def _accumulate(self, phi: Tensor, variance: Tensor, targets: Tensor, mask: Tensor | None) -> None:
         """A += Φ W Φᵀ, b += Φ W y, and the constant of the evidence, with W = 1/variance."""
@@ -234,13 +261,18 @@ class SparseOnlineGP(WhitenedState):
 
     def _add_alone(self, selection: Selection, inputs: Tensor, phi: Tensor) -> Tensor:
         """`_add` for one learner on the CPU, its size known to the host: slices, not one-hot products."""
-        before, after = phi.shape[-2], phi.shape[-2] + selection.pivots.shape[-1]
+        before = phi.shape[-2]
         phi = torch.cat([phi, selection.rows])
-        self.gram_factor[before:after, :after] = phi[:, selection.pivots].mT.tril(before)
-        self.basis[before:after] = inputs[selection.pivots]
+        self._write_rows(phi[:, selection.pivots].mT.tril(before), inputs[selection.pivots], before)
+        return phi
+
+    def _write_rows(self, gram_rows: Tensor, points: Tensor, before: int) -> None:
+        """Append new basis vectors of one learner: their rows of L, [J, before + J], and themselves."""
+        after = before + len(points)
+        self.gram_factor[before:after, :after] = gram_rows
+        self.basis[before:after] = points
         self.stamps[before:after] = self.clock
         self.size.fill_(after)
-        return phi
 
     def _difference(
         self, phi: Tensor, inputs: Tensor, following: GaussianInputs, discount: Tensor
@@ -255,11 +287,12 @@ class SparseOnlineGP(WhitenedState):
         prior = self.kernel.diag(inputs) - 2 * discount * shared + discount.square() * own
         return difference, prior - torch.linalg.vecdot(difference, difference, dim=-2)
 
-    def _churn(self, mask: Tensor | None, points: int) -> Tensor | int:
-        """Most additions to a full basis from one block, for each learner."""
-        if mask is None:
-            return min(-(-points // CHURN), self.overshoot)
-        return (-(-mask.sum(-1) // CHURN)).clamp_max(self.overshoot)
+    def _churn(self, mask: Tensor | None, points: int) -> Tensor:
+        """Most additions to a full basis from the next block: one for every `CHURN`-th observation in it."""
+        if self.order == "arrival":
+            return torch.ones_like(self.observations)
+        after = self.observations + (points if mask is None else mask.sum(-1))
+        return after // CHURN - self.observations // CHURN
 
     def _prune(self, full: Tensor) -> None:
         """Delete the lowest scores of the learners that are `full` until they are back at their budget."""

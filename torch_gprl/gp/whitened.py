@@ -121,15 +121,15 @@ class WhitenedState(nn.Module):
     def alpha(self) -> Float[Tensor, "*batch B"]:
         """α = L⁻ᵀA⁻¹b: the posterior mean is k(x, X_B) α; zero where unused."""
         self.refresh()
-        return _solve(self.gram_factor.mT, self.weights.unsqueeze(-1), upper=True).squeeze(-1)
+        return solve_triangular(self.gram_factor.mT, self.weights.unsqueeze(-1), upper=True).squeeze(-1)
 
     @property
     def C(self) -> Float[Tensor, "*batch B B"]:
         """C = L⁻ᵀ(A⁻¹ − I)L⁻¹ ⪯ 0, Csató's sign: the variance is k(x, x) + k(x, X_B) C k(X_B, x)."""
         self.refresh()
         eye = torch.eye(self.capacity, dtype=self.basis.dtype, device=self.basis.device)
-        inverse_factor = _solve(self.gram_factor, eye.expand_as(self.gram_factor))
-        half = _solve(self.precision_factor, inverse_factor)
+        inverse_factor = solve_triangular(self.gram_factor, eye.expand_as(self.gram_factor))
+        half = solve_triangular(self.precision_factor, inverse_factor)
         return half.mT @ half - inverse_factor.mT @ inverse_factor
 
     def posterior(self, inputs: Float[Tensor, "*#batch N D"] | GaussianInputs) -> Posterior:
@@ -178,7 +178,7 @@ class WhitenedState(nn.Module):
         """
         precision, information = self._whiten(cholesky(self._gram()))
         factor = cholesky(precision)
-        half = _solve(factor, information.unsqueeze(-1))
+        half = solve_triangular(factor, information.unsqueeze(-1))
         log_determinant = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         return self.evidence_constant + 0.5 * (half.square().sum((-2, -1)) - log_determinant)
 
@@ -200,6 +200,8 @@ class WhitenedState(nn.Module):
             self.weights.copy_(solution.squeeze(-1))
             self._stale = False
             if not compiling:
+                rows = self._active().rows
+                self._precision_factor_in_use = self.precision_factor[..., :rows, :rows].contiguous()
                 self._state_seen = self._state_versions()
 
     @torch.no_grad()
@@ -230,7 +232,9 @@ class WhitenedState(nn.Module):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_active_seen": (), "_active_rows": None}
+        """Without what is derived, which a copy makes anew."""
+        derived = {"_active_rows": None, "_precision_factor_in_use": None}
+        return {**self.__dict__, **derived, "_active_seen": (), "_state_seen": ()}
 
     def _kernel_versions(self) -> tuple[int, ...]:
         return id(self.kernel), *(parameter._version for parameter in self._kernel_parameters)
@@ -268,7 +272,7 @@ class WhitenedState(nn.Module):
         """φ = L⁻¹ k(X_B, x) in columns, for the rows in use."""
         active = self._active()
         cross = self._cross(inputs, active)
-        return _solve(active.gram_factor, cross if active.mask is None else cross * active.mask)
+        return solve_triangular(active.gram_factor, cross if active.mask is None else cross * active.mask)
 
     def _prior_variance(self, inputs: Tensor | GaussianInputs) -> Float[Tensor, "*batch N"]:
         """Prior variance of f, or of its average over Gaussian columns, at each point."""
@@ -279,8 +283,9 @@ class WhitenedState(nn.Module):
     def _project(self, inputs: Tensor | GaussianInputs) -> tuple[Tensor, Tensor]:
         """φ and R⁻¹φ with A = RRᵀ: what the basis explains of x, and what the data left open of that."""
         phi = self._features(inputs)
-        rows = phi.shape[-2]
-        return phi, _solve(self.precision_factor[..., :rows, :rows], phi)
+        whole = torch.compiler.is_compiling()  # then all rows are in use
+        factor = self.precision_factor if whole else self._precision_factor_in_use
+        return phi, solve_triangular(factor, phi)
 
     def _gram(self) -> Float[Tensor, "*batch B B"]:
         """K(X_B, X_B) with identity rows where unused, under the kernel's present parameters."""
@@ -290,7 +295,7 @@ class WhitenedState(nn.Module):
 
     def _whiten(self, gram_factor: Tensor) -> tuple[Tensor, Tensor]:
         """(A, b) of the same pseudo-likelihood in the coordinates of another Gram factor L' = L G."""
-        change = _solve(self.gram_factor, gram_factor)  # G
+        change = solve_triangular(self.gram_factor, gram_factor)  # G
         eye = torch.eye(self.capacity, dtype=self.basis.dtype, device=self.basis.device)
         precision = eye + change.mT @ (self.precision - eye) @ change  # I + L'ᵀΛL'
         return precision, (change * self.information.unsqueeze(-1)).sum(-2)  # L'ᵀh
@@ -313,7 +318,8 @@ def _after_load(module: nn.Module, keys: object) -> None:
     module._accept_state()
 
 
-def _solve(factor: Tensor, right: Tensor, upper: bool = False) -> Tensor:
+def solve_triangular(factor: Tensor, right: Tensor, upper: bool = False) -> Tensor:
+    """F⁻¹ R for a triangular F, lower unless told."""
     return torch.linalg.solve_triangular(factor, right, upper=upper)
 
 

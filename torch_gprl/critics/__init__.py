@@ -1,6 +1,23 @@
 """Critics: the bridge between tensordicts of experience and the Gaussian process."""
 
 from torch_gprl.critics.action_value import GPActionValue
+from torch_gprl.critics.calibration import correlation, interval_coverage
+from torch_gprl.critics.estimators import ESTIMATORS, USE_ALL_ACTIONS, EstimatorName, Evaluation
+from torch_gprl.critics.gaussian_actions import action_moments, clipped_moments
 from torch_gprl.critics.returns import k_step_returns
+from torch_gprl.critics.value_estimator import GPStateValue, GPValueEstimator
 
-__all__ = ["GPActionValue", "k_step_returns"]
+__all__ = [
+    "ESTIMATORS",
+    "USE_ALL_ACTIONS",
+    "EstimatorName",
+    "Evaluation",
+    "GPActionValue",
+    "GPStateValue",
+    "GPValueEstimator",
+    "action_moments",
+    "clipped_moments",
+    "correlation",
+    "interval_coverage",
+    "k_step_returns",
+]

@@ -3,15 +3,21 @@
 It owns the one cast between experience (float32) and Gaussian process (float64), the scaling of inputs
 x = (s, a) and the standardisation of targets: the process sees inputs of unit spread and targets of zero mean
 and unit variance, as its zero-mean unit-amplitude prior assumes.
+
+It learns from returns (regression), or from rewards as temporal differences, r = Q(x) − γ E_a' Q(s', a') + n:
+Engel, Mannor and Meir (2005), "Reinforcement learning with Gaussian processes", with the average over the
+policy in closed form.
 """
 
 import torch
 from jaxtyping import Float
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 
+from torch_gprl.critics.gaussian_actions import action_moments, clipped_moments
 from torch_gprl.gp import Posterior, SparseOnlineGP
+from torch_gprl.kernels import GaussianInputs
 
 
 class GPActionValue(TensorDictModuleBase):
@@ -55,6 +61,8 @@ class GPActionValue(TensorDictModuleBase):
         self.register_buffer("action_low", action_low)
         self.register_buffer("action_high", action_high)
 
+    # ---------------------------------------------------------------- values
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write mean and variance of the action value, [*batch, 1] each, in the observation's dtype."""
         observation, action = (tensordict.get(key) for key in self.in_keys)
@@ -65,31 +73,73 @@ class GPActionValue(TensorDictModuleBase):
 
     def value(self, observation: Tensor, action: Tensor) -> Posterior:
         """Posterior of Q in units of the return, at observations [*batch, ..., D] and actions."""
-        posterior = self.gp.posterior(self.inputs(observation, action))
-        scale = self.target_scale.unsqueeze(-1)
-        mean = self.target_loc.unsqueeze(-1) + scale * posterior.mean
-        lead = observation.shape[:-1]
-        return Posterior(mean.reshape(lead), (scale.square() * posterior.variance).reshape(lead))
+        return self._in_units(self.gp.posterior(self.inputs(observation, action)), observation)
 
     def mean_value(self, observation: Tensor, action: Tensor) -> Tensor:
         """Posterior mean of Q alone [*batch, ...], several times cheaper than `value`."""
-        mean = self.gp.mean(self.inputs(observation, action))
-        return (self.target_loc.unsqueeze(-1) + self.target_scale.unsqueeze(-1) * mean).reshape(
-            observation.shape[:-1]
-        )
+        return self._mean_in_units(self.inputs(observation, action), observation)
+
+    def state_value(self, observation: Tensor, loc: Tensor, scale: Tensor) -> Posterior:
+        """Posterior of V(s) = E_a Q(s, a) for actions N(loc, scale²), in closed form.
+
+        Args:
+            observation: [*batch, ..., D].
+            loc: mean of the action, in its units, [*batch, ..., A].
+            scale: standard deviation of the action, [*batch, ..., A].
+        """
+        return self._in_units(self.gp.posterior(self.averaged_inputs(observation, loc, scale)), observation)
+
+    def mean_state_value(self, observation: Tensor, loc: Tensor, scale: Tensor) -> Tensor:
+        """Posterior mean of V(s) alone [*batch, ...]: its gradient in loc and scale is the all-action one."""
+        return self._mean_in_units(self.averaged_inputs(observation, loc, scale), observation)
+
+    def _in_units(self, posterior: Posterior, observation: Tensor) -> Posterior:
+        loc, scale = self.target_loc.unsqueeze(-1), self.target_scale.unsqueeze(-1)
+        lead = observation.shape[:-1]
+        variance = scale.square() * posterior.variance
+        return Posterior((loc + scale * posterior.mean).reshape(lead), variance.reshape(lead))
+
+    def _mean_in_units(self, inputs: Tensor | GaussianInputs, observation: Tensor) -> Tensor:
+        mean = self.target_loc.unsqueeze(-1) + self.target_scale.unsqueeze(-1) * self.gp.mean(inputs)
+        return mean.reshape(observation.shape[:-1])
+
+    # ---------------------------------------------------------------- scaling
 
     def inputs(self, observation: Tensor, action: Tensor) -> Float[Tensor, "*batch N D"]:
         """Scaled inputs of the process [*batch, N, D]: all dimensions beyond the learners become points."""
         if self.action_low is not None:
             action = torch.clamp(action, self.action_low, self.action_high)
-        raw = torch.cat([observation, action], -1).to(self.input_loc.dtype)
-        raw = raw.reshape(*self.gp.batch_shape, -1, raw.shape[-1])
+        raw = self._points(torch.cat([observation, action], -1))
         return (raw - self.input_loc.unsqueeze(-2)) / self.input_scale.unsqueeze(-2)
 
-    def standard_targets(self, target: Tensor) -> Float[Tensor, "*batch N"]:
-        """Targets [*batch, ..., 1] as the process sees them, [*batch, N]."""
+    def averaged_inputs(self, observation: Tensor, loc: Tensor, scale: Tensor) -> GaussianInputs:
+        """Scaled inputs [*batch, N, D] whose action columns are Gaussian: N(loc, scale²) as clipped.
+
+        The clipped action is taken as the Gaussian of the same mean and variance.
+        """
+        loc, scale = loc.to(self.input_loc.dtype), scale.to(self.input_loc.dtype)
+        variance = scale.square()
+        if self.action_low is not None and self.action_high is not None:
+            loc, variance = clipped_moments(loc, scale, self.action_low, self.action_high)
+        dims, actions = self.input_loc.shape[-1], loc.shape[-1]
+        unit = self.input_scale[..., None, dims - actions :].square()
+        columns = tuple(range(dims - actions, dims))
+        return GaussianInputs(self.inputs(observation, loc), self._points(variance) / unit, columns)
+
+    def _points(self, raw: Tensor) -> Tensor:
+        """[*batch, ..., D] as [*batch, N, D] in the process' dtype."""
+        return raw.to(self.input_loc.dtype).reshape(*self.gp.batch_shape, -1, raw.shape[-1])
+
+    def standard_targets(self, target: Tensor, discount: float | Tensor = 0.0) -> Float[Tensor, "*batch N"]:
+        """Targets [*batch, ..., 1] as the process sees them, [*batch, N].
+
+        Args:
+            target: values, or temporal differences Q(x) − γ Q(x').
+            discount: γ, a number or [*batch, N]; 0 for values.
+        """
         flat = target.to(self.target_loc.dtype).reshape(*self.gp.batch_shape, -1)
-        return (flat - self.target_loc.unsqueeze(-1)) / self.target_scale.unsqueeze(-1)
+        # Q = loc + scale · f, hence Q − γQ' = (1 − γ) loc + scale · (f − γf')
+        return (flat - (1 - discount) * self.target_loc.unsqueeze(-1)) / self.target_scale.unsqueeze(-1)
 
     @torch.no_grad()
     def standardise(self, observation: Tensor, action: Tensor, target: Tensor) -> None:
@@ -110,6 +160,8 @@ class GPActionValue(TensorDictModuleBase):
             loc.copy_(data.mean(-2).reshape(loc.shape))
             scale.copy_(torch.where(std > 1e-6, std, 1.0).reshape(scale.shape))
 
+    # ---------------------------------------------------------------- learning
+
     @torch.no_grad()
     def update(
         self, tensordict: TensorDictBase, target_key: str = "value_target", stamp: int | None = None
@@ -127,3 +179,57 @@ class GPActionValue(TensorDictModuleBase):
         observation, action = (tensordict.get(key) for key in self.in_keys)
         target = self.standard_targets(tensordict.get(target_key))
         self.gp.update(self.inputs(observation, action), target, stamp=stamp)
+
+    @torch.no_grad()
+    def update_differences(
+        self,
+        tensordict: TensorDictBase,
+        policy: ProbabilisticTensorDictSequential,
+        discount: float,
+        stamp: int | None = None,
+    ) -> None:
+        """Absorb transitions as temporal differences, r = Q(s, a) − γ E_a' Q(s', a') + noise.
+
+        The average is over the actions of `policy`, whoever made the transitions: off-policy data serve too.
+        Time limits bootstrap, terminal states do not.
+
+        Args:
+            tensordict: transitions [*batch, ...] with observation, action, and under "next" observation,
+                reward and terminated.
+            policy: Gaussian policy whose value is learned.
+            discount: γ per step.
+            stamp: index of the policy update, kept with the basis vectors that this data adds.
+
+        Raises:
+            ValueError: NaN or infinite data, or shapes that do not fit; nothing was learned then.
+        """
+        observation, action = (tensordict.get(key) for key in self.in_keys)
+        following = tensordict.get("next")
+        loc, scale = action_moments(policy, following)
+        rate = discount * ~following.get("terminated").reshape(*self.gp.batch_shape, -1)
+        target = self.standard_targets(following.get("reward"), rate)
+        averaged = self.averaged_inputs(following.get(self.in_keys[0]), loc, scale)
+        inputs = self.inputs(observation, action)
+        self.gp.update(inputs, target, stamp=stamp, next_inputs=averaged, discount=rate)
+
+    @torch.no_grad()
+    def resolve(
+        self,
+        tensordict: TensorDictBase,
+        policy: ProbabilisticTensorDictSequential,
+        discount: float,
+        stamp: int | None = None,
+    ) -> None:
+        """Solve the temporal differences of all given transitions anew, under today's policy.
+
+        The basis stays, what was learned on it is forgotten, and the transitions are absorbed as by
+        `update_differences`: nothing of an older policy's values is left.
+
+        Args:
+            tensordict: transitions [*batch, ...], such as a replay buffer's.
+            policy: Gaussian policy whose value is learned.
+            discount: γ per step.
+            stamp: index of the policy update.
+        """
+        self.gp.forget()
+        self.update_differences(tensordict, policy, discount, stamp)

@@ -45,7 +45,7 @@ def select_novel(
 def _pick_alone(residual_gram: Tensor, novelty: Tensor, threshold: Tensor, limit: Tensor) -> Selection:
     """One learner: the picks are host numbers, and steps work on views. Twice as fast as a batch of 1."""
     most = min(int(limit), novelty.shape[0])
-    excess, novelty = novelty - threshold, novelty.clone()
+    excess = novelty - threshold
     rows = residual_gram.new_empty(most, novelty.shape[0])
     pivots: list[int] = []
     for pick in range(most):
@@ -55,13 +55,12 @@ def _pick_alone(residual_gram: Tensor, novelty: Tensor, threshold: Tensor, limit
         row, earlier = rows[pick], rows[:pick]
         torch.addmv(residual_gram[pivot], earlier.mT, earlier[:, pivot], alpha=-1, out=row)
         row.mul_(row[pivot].rsqrt())
-        novelty.addcmul_(row, row, value=-1)
         excess.addcmul_(row, row, value=-1)
         excess[pivot] = -torch.inf
         pivots.append(pivot)
-    accepted = torch.ones(len(pivots), dtype=torch.bool, device=novelty.device)
     index = torch.tensor(pivots, dtype=torch.long, device=novelty.device)
-    return Selection(index, accepted, rows[: len(pivots)], novelty)
+    left = (excess + threshold).index_fill_(0, index, 0.0)  # nothing is missed of a basis vector
+    return Selection(index, torch.ones_like(index, dtype=torch.bool), rows[: len(pivots)], left)
 
 
 def _pick_batched(residual_gram: Tensor, novelty: Tensor, threshold: Tensor, limit: Tensor) -> Selection:

@@ -37,7 +37,7 @@ NOVELTY_FLOOR = {torch.float64: 1e-10, torch.float32: 1e-4}
 
 
 class Active(NamedTuple):
-    """The rows in use, up to those of the largest basis among the learners, as contiguous tensors."""
+    """The rows in use, up to those of the largest basis among the learners."""
 
     rows: int
     basis: Float[Tensor, "*batch R D"]
@@ -252,12 +252,14 @@ class WhitenedState(nn.Module):
             sizes = self.size.flatten().tolist()
             rows = max(sizes, default=0)
             mask = None if min(sizes, default=0) == rows else self.mask[..., :rows].unsqueeze(-1)
-            factor, basis = (
-                self.gram_factor[..., :rows, :rows].contiguous(),
-                self.basis[..., :rows, :].contiguous(),
-            )
+            basis = self.basis[..., :rows, :].contiguous()
+            factor = self.gram_factor[..., :rows, :rows]
             self._active_rows = Active(rows, basis, self.kernel.against(basis), factor, mask)
             self._active_seen = seen
+        elif not self._active_rows.gram_factor.is_contiguous():
+            # a basis that stays is worth a copy that the solver takes as it is
+            factor = self._active_rows.gram_factor.contiguous()
+            self._active_rows = self._active_rows._replace(gram_factor=factor)
         return self._active_rows
 
     # ---------------------------------------------------------------- inside

@@ -25,7 +25,7 @@ from benchmarks.timing import machine, matrix_product, rates
 BUDGET, BLOCK = 200, 32
 LEARNER_BUDGET = 100
 NEVER = 1e12  # a novelty threshold that no point exceeds: the basis is settled
-Row = dict[str, str | float | None]
+Row = dict[str, str | float]
 
 
 @dataclass(frozen=True)
@@ -139,13 +139,13 @@ def compare_over(effort: Effort, variable: str, values: Sequence[int]) -> Iterat
             yield {"variable": variable, "value": value, "peer": peer, "updates_per_second": speed[peer]}
 
 
-def operations(rows: int, block: int, dims: int) -> int:
-    """Floating point operations of a block on a settled basis of `rows`: 3 n² + 2 n (D + 2) for each point.
+def operations(rows: int, dims: int) -> int:
+    """Floating point operations of a point on a settled basis of n `rows`: 3 n² + 2 n (D + 2).
 
     φ = L⁻¹k costs n², A += ΦWΦᵀ costs 2 n², the distances 2 n D, novelty and b 2 n each; the exponentials of
     the kernel, n more, are not counted.
     """
-    return block * (3 * rows**2 + 2 * rows * (dims + 2))
+    return 3 * rows**2 + 2 * rows * (dims + 2)
 
 
 def measure_settled(effort: Effort) -> Iterator[Row]:
@@ -158,7 +158,7 @@ def measure_settled(effort: Effort) -> Iterator[Row]:
         feed.block = block
         peer.gp.novelty_threshold = NEVER
         speed = rates({"update": feed, "matrix product": matrix_product()}, effort.rounds, effort.turn)
-        work = operations(int(peer.gp.size), 1, stream.inputs.shape[-1]) * speed["update"]
+        work = operations(int(peer.gp.size), stream.inputs.shape[-1]) * speed["update"]
         yield {
             "budget": budget,
             "block": block,

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch_gprl.kernels import SquaredExponential
 
 TEST_POINTS = 1000
+TEST_TRAJECTORIES = 50  # that the test points of simulated streams are spread over
 DISCOUNT = 0.97
 
 
@@ -51,7 +52,7 @@ def pendulum(points: int, seed: int = 0) -> Stream:
     """
     generator = torch.Generator().manual_seed(seed)
     length, horizon = 200, 100  # steps that are learned from, and steps that only pay
-    trajectories = math.ceil((points + TEST_POINTS) / length)
+    trajectories = math.ceil(points / length) + TEST_TRAJECTORIES
     angle, speed, noise = 3.0 * _normal(generator, 3, trajectories)
     states, rewards = [], []
     for _ in range(length + horizon):
@@ -63,10 +64,8 @@ def pendulum(points: int, seed: int = 0) -> Stream:
         speed = (speed + 0.05 * (15 * angle.sin() + 3 * torque)).clamp(-8, 8)
         angle = torch.remainder(angle + 0.05 * speed + math.pi, 2 * math.pi) - math.pi
     returns = _discounted(torch.stack(rewards, 1))[:, :length]
-    inputs = torch.stack(states, 1)[:, :length]
-    return _standardised(
-        inputs.flatten(0, 1), returns.flatten(), points, lengthscale=0.7, noise_variance=0.12
-    )
+    inputs, targets = _in_order(torch.stack(states, 1)[:, :length], returns, points)
+    return _standardised(inputs, targets, points, lengthscale=0.7, noise_variance=0.12)
 
 
 def novel(points: int, seed: int = 0) -> Stream:
@@ -84,19 +83,20 @@ def novel(points: int, seed: int = 0) -> Stream:
 def cheetah(points: int, seed: int = 0) -> Stream:
     """17 states that rotate and drift with 6 autoregressive actions, and a discounted return: 23 inputs."""
     generator = torch.Generator().manual_seed(seed)
-    walks, steps = 16, math.ceil((points + TEST_POINTS) / 16) + 100
+    length, horizon = 500, 100
+    walks = math.ceil(points / length) + TEST_TRAJECTORIES
     turn = torch.linalg.matrix_exp(0.05 * (lambda a: a - a.mT)(_normal(generator, 17, 17)))
     push, goal = 0.1 * _normal(generator, 6, 17), _normal(generator, 17) / 17**0.5
     state, action = _normal(generator, walks, 17), _normal(generator, walks, 6)
     visited, rewards = [], []
-    for _ in range(steps):
+    for _ in range(length + horizon):
         action = 0.8 * action + 0.6 * _normal(generator, walks, 6)
         visited.append(torch.cat([state, action], -1))
         rewards.append((state @ goal).tanh() - 0.05 * action.square().sum(-1))
         state = 0.97 * state @ turn + action @ push + 0.1 * _normal(generator, walks, 17)
-    returns = _discounted(torch.stack(rewards, 1))[:, :-100]
-    inputs = torch.stack(visited, 1)[:, :-100]
-    return _standardised(inputs.flatten(0, 1), returns.flatten(), points, lengthscale=5.0, noise_variance=0.3)
+    returns = _discounted(torch.stack(rewards, 1))[:, :length]
+    inputs, targets = _in_order(torch.stack(visited, 1)[:, :length], returns, points)
+    return _standardised(inputs, targets, points, lengthscale=5.0, noise_variance=0.3)
 
 
 def settled(points: int, seed: int = 0) -> Stream:
@@ -155,11 +155,22 @@ def _discounted(rewards: Tensor) -> Tensor:
     return returns
 
 
+def _in_order(inputs: Tensor, returns: Tensor, points: int) -> tuple[Tensor, Tensor]:
+    """Points along one trajectory [E, T] after the other, then test points from trajectories of their own."""
+    every = inputs.shape[1] * TEST_TRAJECTORIES // TEST_POINTS
+    learned, held_out = slice(-TEST_TRAJECTORIES), slice(-TEST_TRAJECTORIES, None)
+    parts = (
+        (data[learned].flatten(0, 1)[:points], data[held_out, ::every].flatten(0, 1))
+        for data in (inputs, returns)
+    )
+    inputs, returns = map(torch.cat, parts)
+    return inputs, returns
+
+
 def _standardised(
     inputs: Tensor, targets: Tensor, points: int, lengthscale: float, noise_variance: float
 ) -> Stream:
     """The first `points` are the stream, the next the test set."""
-    inputs, targets = inputs[: points + TEST_POINTS], targets[: points + TEST_POINTS]
     inputs = (inputs - inputs.mean(0)) / inputs.std(0)
     targets = (targets - targets.mean()) / targets.std()
     return Stream(

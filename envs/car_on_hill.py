@@ -126,7 +126,7 @@ class CarOnHill(Task):
 
     def physics(self, copies: int, threads: int) -> TorchPhysics:
         """The equation of motion in torch; `threads` is not used."""
-        return TorchPhysics(transition, copies, (1, 1))
+        return TorchPhysics(transition, copies, (1, 1, 1))
 
     def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]]:
         """At rest: p uniform in [−0.1, 0.1)."""

@@ -89,7 +89,8 @@ class Copies:
         self.all = np.arange(self.size)
         self.low = torch.tensor(task.action_low, dtype=torch.float64)
         self.high = torch.tensor(task.action_high, dtype=torch.float64)
-        self.steps = np.zeros(self.size, dtype=np.int64)
+        self._steps = torch.zeros(self.size, dtype=torch.int64)
+        self.steps = self._steps.numpy()
         self.divergences = 0
         self._horizon = task.horizon if options.horizon is None else options.horizon
         self._physics = task.physics(self.size, _threads(options.threads, self.size))
@@ -160,25 +161,24 @@ class Copies:
         Args:
             action: [B, da] finite commands in the actuators' units; noise is added, then they are clipped.
         """
-        self.steps += 1
+        self._steps += 1
         for noise in self._noise.values():
             noise.advance(self.steps)
         if "action" in self._noise:
             action = action + self._noise["action"].now
-        action = torch.clamp(action, self.low, self.high)
-        before = self._physics.advance(action)
+        applied = torch.clamp(action, self.low, self.high, out=self._physics.control)
+        before = self._physics.advance()
         if "velocity" in self._noise:
             self.state.qvel.add_(self._noise["velocity"].now)
         diverged = self._physics.diverged()
         if diverged is not None:
             self.divergences += int(diverged.sum())
             self._physics.restore(diverged)
-        reward, parts = self.task.reward(before, action, self.state)
+        reward, parts = self.task.reward(before, applied, self.state)
         terminated = self.task.terminated(self.state)
         if diverged is not None:
             terminated = terminated | diverged
-        truncated = torch.from_numpy(self.steps >= self._horizon)
-        return Step(self.observation(), reward, parts, terminated, truncated)
+        return Step(self.observation(), reward, parts, terminated, self._steps >= self._horizon)
 
 
 def _threads(threads: int | None, copies: int) -> int:

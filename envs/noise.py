@@ -37,7 +37,11 @@ class StepNoise:
 
     def start(self, rows: NDArray[np.intp]) -> None:
         """Environments `rows` [R] begin a new episode: they are at step 0 of it now."""
-        self._fill(rows, np.zeros(len(rows), dtype=np.int64))
+        steps = np.zeros(len(rows), dtype=np.int64)
+        if len(rows) == len(self._all):
+            self.resume(steps)
+        else:
+            self._fill(rows, steps)
 
     def advance(self, steps: NDArray[np.int64]) -> None:
         """All environments have moved to the next step; `steps` [B] is where each is in its episode."""

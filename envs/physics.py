@@ -54,16 +54,18 @@ class Physics(abc.ABC):
         qvel: [B, nv] float64, likewise.
         derived: further live views, name -> [B, ...].
         rows: [B, n] float64, a live view of all that the future depends on.
+        control: [B, nu] float64, a live view of what acts during the next step: write to it.
     """
 
     rows: Tensor
+    control: Tensor
     qpos: Tensor
     qvel: Tensor
     derived: dict[str, Tensor]
 
     @abc.abstractmethod
-    def advance(self, control: Float[Tensor, "B nu"]) -> State:
-        """Advance every copy by one control step under a constant control.
+    def advance(self) -> State:
+        """Advance every copy by one control step under the present `control`.
 
         Returns:
             The state before the step, valid until the next one.
@@ -106,13 +108,14 @@ class MujocoPhysics(Physics):
     ) -> None:
         self.model = model
         self.batch = mujoco.batch.Batch(model, copies, nthread=threads, persistent=persistent)
-        self._substeps = substeps
+        self.substeps = substeps
         self.rows = torch.from_numpy(self.batch.state)
         self._before = self.rows.clone()
         qpos, qvel, control = (self._columns(name) for name in ("qpos", "qvel", "ctrl"))
-        self.qpos, self.qvel, self._control = self.rows[:, qpos], self.rows[:, qvel], self.rows[:, control]
+        self.qpos, self.qvel, self.control = self.rows[:, qpos], self.rows[:, qvel], self.rows[:, control]
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # nor do we write it
+            # MuJoCo overwrites these at each call; we write them only to undo a step.
+            warnings.filterwarnings("ignore", "The given NumPy array is not writable")
             self.derived = {name: torch.from_numpy(self.batch.bind(name)) for name in derived}
         self._past_derived = {name: value.clone() for name, value in self.derived.items()}
         self._past = State(self._before[:, qpos], self._before[:, qvel], self._past_derived)
@@ -133,13 +136,12 @@ class MujocoPhysics(Physics):
         first = (view.ctypes.data - self.batch.state.ctypes.data) // view.itemsize
         return slice(first, first + view.shape[1])
 
-    def advance(self, control: Float[Tensor, "B nu"]) -> State:
+    def advance(self) -> State:
         """Advance every copy by `substeps` physics steps; see `Physics.advance`."""
         self._before.copy_(self.rows)
         for name, value in self.derived.items():
             self._past_derived[name].copy_(value)
-        self._control.copy_(control)
-        self.batch.step(nstep=self._substeps)
+        self.batch.step(nstep=self.substeps)
         return self._past
 
     def place(self, rows: NDArray[np.intp], qpos: Float[Tensor, "R nq"], qvel: Float[Tensor, "R nv"]) -> None:
@@ -152,17 +154,20 @@ class MujocoPhysics(Physics):
 
     def diverged(self) -> Bool[Tensor, " B"] | None:
         """Where MuJoCo had to reset a copy, or left it beyond `LARGEST`; see `Physics.diverged`."""
-        largest = np.abs(self.batch.state).max()
-        if largest <= LARGEST and not self.batch.warning.any():  # NaN fails the first test
+        # A sum of squares within the bound's square proves all entries within the bound; NaN fails the test.
+        state = self.batch.state
+        if np.vdot(state, state) <= LARGEST**2 and not self.batch.warning.any():
             return None
         bad = (self.batch.warning[:, BAD_STATE, 1] > 0).any(axis=1)
         self.batch.warning[:] = 0
-        bad |= ~(np.abs(self.batch.state).max(axis=1) <= LARGEST)
+        bad |= ~(np.abs(state).max(axis=1) <= LARGEST)
         return torch.from_numpy(bad) if bad.any() else None
 
     def restore(self, rows: Bool[Tensor, " B"]) -> None:
         """Put back the state before the last step; see `Physics.restore`."""
         self.rows[rows] = self._before[rows]
+        for name, value in self.derived.items():
+            value[rows] = self._past_derived[name][rows]
 
 
 class TorchPhysics(Physics):
@@ -172,27 +177,27 @@ class TorchPhysics(Physics):
         transition: (qpos [B, nq], qvel [B, nv], control [B, nu]) -> the positions and velocities one control
             step later.
         copies: how many, B.
-        sizes: nq and nv.
+        sizes: nq, nv and nu.
     """
 
     def __init__(
         self,
         transition: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
         copies: int,
-        sizes: tuple[int, int],
+        sizes: tuple[int, int, int],
     ) -> None:
         self._transition = transition
         self.rows = torch.zeros(copies, sum(sizes), dtype=torch.float64)
         self._before = self.rows.clone()
-        self.qpos, self.qvel = self.rows.split(sizes, dim=1)
-        past_qpos, past_qvel = self._before.split(sizes, dim=1)
+        self.qpos, self.qvel, self.control = self.rows.split(sizes, dim=1)
+        past_qpos, past_qvel, _ = self._before.split(sizes, dim=1)
         self._past = State(past_qpos, past_qvel)
         self.derived = {}
 
-    def advance(self, control: Float[Tensor, "B nu"]) -> State:
+    def advance(self) -> State:
         """Apply the transition; see `Physics.advance`."""
         self._before.copy_(self.rows)
-        qpos, qvel = self._transition(self._past.qpos, self._past.qvel, control)
+        qpos, qvel = self._transition(self._past.qpos, self._past.qvel, self.control)
         self.qpos.copy_(qpos)
         self.qvel.copy_(qvel)
         return self._past

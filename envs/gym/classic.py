@@ -67,7 +67,7 @@ class Pendulum(Classic):
 
     def physics(self, copies: int, threads: int) -> TorchPhysics:
         """Gymnasium's map in torch; `threads` is not used."""
-        return TorchPhysics(swing, copies, (1, 1))
+        return TorchPhysics(swing, copies, (1, 1, 1))
 
     def start_one(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Any angle, up to 1 rad/s."""
@@ -101,7 +101,7 @@ class MountainCar(Classic):
 
     def physics(self, copies: int, threads: int) -> TorchPhysics:
         """Gymnasium's map in torch; `threads` is not used."""
-        return TorchPhysics(drive, copies, (1, 1))
+        return TorchPhysics(drive, copies, (1, 1, 1))
 
     def start_one(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """At rest, near the valley's lowest point."""

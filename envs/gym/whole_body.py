@@ -37,9 +37,9 @@ class ContactPhysics(MujocoPhysics):
         self.derived[FORCES] = torch.from_numpy(self._forces)
         self._past_derived[FORCES] = self.derived[FORCES].clone()
 
-    def advance(self, control: Float[Tensor, "B nu"]) -> State:
+    def advance(self) -> State:
         """Advance every copy, then compute the external forces; see `Physics.advance`."""
-        past = super().advance(control)
+        past = super().advance()
         for copy, forces in enumerate(self._forces):
             data = self.batch.get_data(copy, self._data)
             mujoco.mj_rnePostConstraint(self.model, data)

@@ -45,7 +45,7 @@ def motion(ratio: float, start: list[float], seconds: float) -> np.ndarray:
     physics.place(np.arange(1), qpos, qvel)
     states = [np.array(start)]
     for _ in range(round(seconds / 0.002)):
-        physics.advance(torch.zeros(1, 1, dtype=torch.float64))
+        physics.advance()
         states.append(torch.cat([physics.qpos, physics.qvel], 1)[0].numpy().copy())
     return np.stack(states)
 

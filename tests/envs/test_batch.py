@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from torchrl.envs import RewardSum, TransformedEnv
+from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 import envs
@@ -96,6 +96,24 @@ def test_a_time_limit_truncates_and_does_not_terminate():
     assert not out["terminated"].any()
 
 
+@pytest.mark.parametrize("info", [True, False])
+def test_the_short_way_through_a_step_gives_what_torchrls_own_gives(info):
+    """The same entries, nested ones of other programs included, at every step of runs with resets."""
+    pair = [envs.make("pendulum-balance", num_envs=3, seed=1, horizon=9, info=info) for _ in range(2)]
+    now = [env.reset() for env in pair]
+    for time in range(20):
+        for env, data in zip(pair, now, strict=True):
+            data["action"] = actions(env, 20)[time]
+            data["collector", "ids"] = torch.full((1, 3), time)
+        ours = pair[0].step_and_maybe_reset(now[0])
+        theirs = EnvBase.step_and_maybe_reset(pair[1], now[1])
+        for mine, other in zip(ours, theirs, strict=True):
+            assert set(mine.keys(True, True)) == set(other.keys(True, True))
+            assert (mine == other).all()
+        assert ours[1]["collector"] is not ours[0]["collector"]
+        now = [ours[1], theirs[1]]
+
+
 def test_transforms_see_whole_episodes():
     env = TransformedEnv(envs.make("pendulum-swingup", num_envs=3, horizon=10), RewardSum())
     out = env.rollout(20, break_when_any_done=False)["next"]
@@ -165,6 +183,18 @@ def test_a_diverged_simulation_ends_and_leaves_no_bad_number():
     env.place(torch.ones(1, 3, 1).double(), torch.tensor([0.0, 1e300, 0.0]).double().view(1, 3, 1))
     out = env.step(env.full_action_spec.zero())["next"]
     assert out["terminated"].flatten().tolist() == [False, True, False]
+    assert env.divergences == 1
+
+
+def test_a_diverged_simulation_with_contacts_ends_and_leaves_no_bad_number():
+    env = envs.make("Ant-v5", num_envs=2, info=True)
+    env.reset()
+    speed = torch.zeros(1, 2, env.qvel.shape[-1], dtype=torch.float64)
+    speed[0, 1] = 1e9
+    env.place(env.qpos, speed)
+    out = env.step(env.full_action_spec.zero())["next"]
+    assert out["terminated"].flatten().tolist() == [False, True]
+    assert all(value.double().isfinite().all() for value in out.values(True, True))
     assert env.divergences == 1
 
 

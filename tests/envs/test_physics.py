@@ -13,7 +13,8 @@ def test_a_step_returns_the_state_before_it():
     physics = MujocoPhysics(stripped(pendulum.MODEL), copies=3, substeps=2, threads=1)
     physics.place(np.arange(3), torch.rand(3, 1).double(), torch.rand(3, 1).double())
     qpos, qvel = physics.qpos.clone(), physics.qvel.clone()
-    before = physics.advance(torch.ones(3, 1).double())
+    physics.control.fill_(1)
+    before = physics.advance()
     assert torch.equal(before.qpos, qpos)
     assert torch.equal(before.qvel, qvel)
     assert not torch.equal(physics.qvel, qvel)
@@ -27,7 +28,8 @@ def test_the_stripped_model_moves_as_the_whole_one_bit_for_bit():
     data.qpos[:] = 1
     for step in range(500):
         control = np.sin(step)
-        batch.advance(torch.full((1, 1), control, dtype=torch.float64))
+        batch.control.fill_(control)
+        batch.advance()
         data.ctrl[:] = control
         mujoco.mj_step(whole, data)
     assert batch.qpos.item() == data.qpos[0]

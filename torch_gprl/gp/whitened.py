@@ -220,7 +220,8 @@ class WhitenedState(nn.Module):
     def _accept_state(self) -> None:
         """The state was just made for the present kernel; everything derived from it is out of date."""
         self._stale = True
-        self._kernel_parameters = list(self.kernel.parameters())
+        # a kernel on a graph changes with the graph, which it keeps in buffers
+        self._kernel_tensors = [*self.kernel.parameters(), *self.kernel.buffers()]
         self._kernel_seen = self._kernel_versions()
         self._state_seen: tuple[int, ...] = ()
         self._active_seen: tuple[int, ...] = ()
@@ -237,7 +238,7 @@ class WhitenedState(nn.Module):
         return {**self.__dict__, **derived, "_active_seen": (), "_state_seen": ()}
 
     def _kernel_versions(self) -> tuple[int, ...]:
-        return id(self.kernel), *(parameter._version for parameter in self._kernel_parameters)
+        return id(self.kernel), *(tensor._version for tensor in self._kernel_tensors)
 
     def _state_versions(self) -> tuple[int, ...]:
         return self.precision._version, self.information._version, id(self.precision)

@@ -4,6 +4,7 @@ from torch_gprl.kernels.base import Kernel, Product, Scaled, Sum
 from torch_gprl.kernels.columns import Columns
 from torch_gprl.kernels.gaussian_inputs import GaussianInputs
 from torch_gprl.kernels.gpytorch import GPyTorchKernel
+from torch_gprl.kernels.graph_nodes import GraphMatern, ShortestPathKernel
 from torch_gprl.kernels.linear import Linear
 from torch_gprl.kernels.parameters import Positive
 from torch_gprl.kernels.stationary import Matern, Periodic, RationalQuadratic, SquaredExponential
@@ -12,6 +13,7 @@ __all__ = [
     "Columns",
     "GPyTorchKernel",
     "GaussianInputs",
+    "GraphMatern",
     "Kernel",
     "Linear",
     "Matern",
@@ -20,6 +22,7 @@ __all__ = [
     "Product",
     "RationalQuadratic",
     "Scaled",
+    "ShortestPathKernel",
     "SquaredExponential",
     "Sum",
 ]

@@ -1,0 +1,123 @@
+"""What the kernels on a graph share: what the graph says of an input, and what it leaves open.
+
+A graph knows its nodes. Any other input borrows from the nodes near it, with features F(x), |F(x)| ≤ 1:
+
+    k(x, z) = σ² (F(x) F(z)ᵀ + √(ρ(x) ρ(z)) exp(−|x − z|/ℓ)),   ρ(x) = 1 − |F(x)|²
+
+The second term is an ordinary Matérn 1/2 kernel for the part that the graph leaves open. Without nodes, and
+far from all of them, nothing else remains. Positive semi-definite by construction, with prior variance σ²
+everywhere.
+"""
+
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torch_gprl.kernels.base import Kernel
+from torch_gprl.kernels.distance import log_gaussian
+from torch_gprl.kernels.parameters import Positive, PositiveValue, log_parameter
+from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
+
+Table = tuple[Tensor, ...]
+Factors = tuple[Tensor, Tensor]
+
+REMEMBERED = 4  # inputs whose features are kept: a basis, and what one step compares it with
+SMALLEST_REST = 1e-12  # of what the graph leaves open: a root of 0 has no derivative
+
+
+class TableKernel(Kernel):
+    """A kernel F(x) F(z)ᵀ + … whose features need a table made from graph and parameters alone.
+
+    The table is kept until one of these changes, and so are the features of the last few inputs, which one
+    step of a Gaussian process asks for several times. With gradients enabled all is made anew by each call.
+
+    Args:
+        input_dim: number of input columns D.
+        batch_shape: independent kernels, each on a graph of its own.
+    """
+
+    def __init__(self, input_dim: int, batch_shape: Sequence[int] = ()) -> None:
+        super().__init__(input_dim, batch_shape)
+        self._table: Table = ()
+        self._table_seen: tuple[int, ...] = ()
+        self._remembered: deque[tuple[Tensor, int, Factors]] = deque(maxlen=REMEMBERED)
+
+    @abstractmethod
+    def _build_table(self) -> Table:
+        """What depends on graph and parameters alone."""
+
+    @abstractmethod
+    def _build_features(self, x: Tensor, table: Table) -> Factors:
+        """Factors of F at x [*batch, N, D]."""
+
+    def features(self, x: Inputs) -> Factors:
+        """Left and right factor such that left(x) right(z)ᵀ = F(x) F(z)ᵀ: [*batch, N, R] each."""
+        sources = [*self.parameters(), *self.buffers()]
+        x = x.to(sources[0].dtype)
+        if torch.is_grad_enabled() and (x.requires_grad or any(source.requires_grad for source in sources)):
+            return self._build_features(x, self._build_table())
+        with torch.no_grad():
+            seen = *(t._version for t in sources), *(t.data_ptr() for t in sources)
+            if seen != self._table_seen:
+                self._table = self._build_table()
+                self._table_seen = seen
+                self._remembered.clear()
+            for old, version, found in self._remembered:
+                if old is x and version == x._version:
+                    return found
+            found = self._build_features(x, self._table)
+            self._remembered.append((x, x._version, found))
+            return found
+
+
+class GraphKernel(TableKernel):
+    """σ² (what the graph explains + what it leaves open).
+
+    Args:
+        input_dim: number of input columns D.
+        lengthscale: ℓ, the length over which correlation falls to 1/e, in units of the inputs; broadcasts to
+            [*batch_shape].
+        outputscale: σ², prior variance; broadcasts to [*batch_shape].
+        batch_shape: independent kernels, each on a graph of its own.
+    """
+
+    lengthscale = Positive()
+    outputscale = Positive()
+
+    def __init__(
+        self,
+        input_dim: int,
+        lengthscale: PositiveValue = 1.0,
+        outputscale: PositiveValue = 1.0,
+        batch_shape: Sequence[int] = (),
+    ) -> None:
+        super().__init__(input_dim, batch_shape)
+        self.log_lengthscale = log_parameter(lengthscale, "lengthscale", batch_shape)
+        self.log_outputscale = log_parameter(outputscale, "outputscale", batch_shape)
+
+    def forward(self, x: Inputs, z: OtherInputs) -> CrossMatrix:
+        """Covariance of x [*batch, N, D] with z [*batch, M, D]: [*batch, N, M]."""
+        left, right = self.features(x)
+        other_left, other_right = (left, right) if z is x else self.features(z)
+        rest, other_rest = _left_open(left, right), _left_open(other_left, other_right)
+        leftover = rest.unsqueeze(-1) * other_rest.unsqueeze(-2) * self._euclidean(x, z)
+        return self.outputscale[..., None, None] * (left @ other_right.mT + leftover)
+
+    def diag(self, x: Inputs) -> PerPoint:
+        """The output scale at every row of x [*batch, N, D]: [*batch, N]."""
+        batch = torch.broadcast_shapes(x.shape[:-2], self.batch_shape)
+        return self.outputscale.unsqueeze(-1).expand(*batch, x.shape[-2])
+
+    def _euclidean(self, x: Tensor, z: Tensor) -> Tensor:
+        """exp(−|x − z|/ℓ)."""
+        log_lengthscale = self.log_lengthscale.unsqueeze(-1).expand(*self.batch_shape, self.input_dim)
+        square = -2 * log_gaussian(x, z, log_lengthscale)
+        return (-square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()).exp()
+
+
+def _left_open(left: Tensor, right: Tensor) -> Tensor:
+    """√ρ = √(1 − |F|²); roundoff may carry |F|² a hair beyond one."""
+    return (1 - torch.linalg.vecdot(left, right)).clamp_min(SMALLEST_REST).sqrt()

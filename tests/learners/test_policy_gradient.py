@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.envs import PendulumEnv
 
 import envs
+from torch_gprl.critics import GPValueEstimator
 from torch_gprl.learners import PolicyGradient, PolicyGradientConfig
 from torch_gprl.policies import Controller, LinearController, MLPController, RBFController
 
@@ -137,12 +138,12 @@ def at_the_last_loss(learner: PolicyGradient) -> TensorDict:
     def remember(module: torch.nn.Module, args: tuple[TensorDict]) -> None:
         seen.append(copy.deepcopy((args[0], learner.policy.state_dict(), learner.critic.state_dict())))
 
-    learner.loss.register_forward_pre_hook(remember)
+    learner.losses[0].register_forward_pre_hook(remember)
     list(learner.train())
-    rollout, policy, critic = seen[-1]
+    _, policy, critic = seen[-1]
     learner.policy.load_state_dict(policy)
     learner.critic.load_state_dict(critic)
-    return rollout
+    return torch.cat([half for half, _, _ in seen[-2:]], 1)  # half of the environments at a time
 
 
 def weighed(**numbers: Any) -> tuple[PolicyGradient, TensorDict]:
@@ -150,44 +151,25 @@ def weighed(**numbers: Any) -> tuple[PolicyGradient, TensorDict]:
     return learner, at_the_last_loss(learner)
 
 
-@pytest.mark.parametrize("baseline", [False, True])
-@pytest.mark.parametrize("horizon", [1, 7, STEPS])
-def test_weights_are_rewards_up_to_the_horizon_then_the_critics_value(horizon, baseline):
-    learner, rollout = weighed(horizon=horizon, baseline=baseline)
-    with torch.no_grad():
-        taken = learner.critic.value(rollout["observation"], rollout["action"]).mean
-        mean_action = learner.policy.head.parameters_at(rollout["next", "observation"])[0]
-        ending = learner.critic.value(rollout["next", "observation"], mean_action).mean
-        own_action = learner.policy.head.parameters_at(rollout["observation"])[0]
-        value = learner.critic.value(rollout["observation"], own_action).mean
-    reward, done, terminated = (rollout["next", key].squeeze(-1) for key in ("reward", "done", "terminated"))
-    assert terminated.any()  # else the test would say nothing of ends
-    target = torch.zeros_like(reward)
-    for place in itertools.product(range(2), range(ENVS), range(STEPS)):
-        learner_index, env, start = place
-        for i in range(horizon):
-            t = start + i
-            here = learner_index, env, t
-            target[place] += 0.98**i * reward[here]
-            if done[here] or t == STEPS - 1:
-                target[place] += 0.0 if terminated[here] else 0.98 ** (i + 1) * ending[here]
-                break
-            if i == horizon - 1:
-                target[place] += 0.98**horizon * taken[learner_index, env, t + 1]
-    torch.testing.assert_close(rollout["value_target"].squeeze(-1), target, rtol=1e-8, atol=1e-8)
-    expected = target - value if baseline else target
-    torch.testing.assert_close(rollout["advantage"].squeeze(-1), expected, rtol=1e-8, atol=1e-8)
+@pytest.mark.parametrize("in_sample", [False, True])
+@pytest.mark.parametrize("name", ["k-step", "k-step-baseline", "generalised", "control-variate"])
+def test_actions_are_weighed_by_the_critic_of_the_moment(name, in_sample):
+    learner, rollout = weighed(estimator=name, in_sample=in_sample)
+    assert rollout["next", "terminated"].any()  # else the test would say nothing of ends
+    assert learner.critic.gp.clock == int(in_sample)  # the update whose experience it learned last
+    expected = GPValueEstimator(learner.critic, learner.policy, 0.98, name, 20)(rollout.clone())
+    for key in ("advantage", "value_target"):
+        torch.testing.assert_close(rollout[key], expected[key], rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.parametrize("baseline", [False, True])
-def test_horizon_0_weighs_by_the_critic_alone(baseline):
-    learner, rollout = weighed(horizon=0, baseline=baseline)
-    with torch.no_grad():
-        expected = learner.critic.value(rollout["observation"], rollout["action"]).mean
-        if baseline:
-            own_action = learner.policy.head.parameters_at(rollout["observation"])[0]
-            expected = expected - learner.critic.value(rollout["observation"], own_action).mean
-    torch.testing.assert_close(rollout["advantage"].squeeze(-1), expected, rtol=1e-8, atol=1e-8)
+def test_discounted_states_weigh_less_the_later_in_their_episode():
+    plain, discounted = (
+        at_the_last_loss(PolicyGradient(pendulums(2), config(1, discount_states=flag)))
+        for flag in (False, True)
+    )
+    weight = 0.98 ** discounted["step_count"]
+    torch.testing.assert_close(discounted["advantage"], weight * plain["advantage"], rtol=1e-6, atol=1e-6)
+    assert weight.min() < 0.6
 
 
 def test_the_critic_keeps_to_its_budget_and_stamps_the_update():
@@ -254,7 +236,7 @@ def test_balancing_improves():
         ({"discount": 1.1}, "discount must lie between 0 and 1, got 1.1"),
         ({"horizon": -1}, "horizon must be at least 0"),
         ({"controller": "spline"}, "controller must be one of linear, rbf, mlp, got 'spline'"),
-        ({"optimiser": "sgd"}, "optimiser must be one of natural, adam, got 'sgd'"),
+        ({"optimiser": "sgd"}, "optimiser must be one of natural, adam, plain, got 'sgd'"),
     ],
 )
 def test_numbers_out_of_range_are_refused(numbers, message, monkeypatch):

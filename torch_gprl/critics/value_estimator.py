@@ -121,7 +121,10 @@ class GPValueEstimator(ValueEstimatorBase):
             params: of a value network; a Gaussian process has none.
             target_params: likewise.
         """
-        seen = self.evaluate(tensordict)
+        return self.write(tensordict, self.evaluate(tensordict))
+
+    def write(self, tensordict: TensorDictBase, seen: Evaluation) -> TensorDictBase:
+        """`forward`, given what `evaluate` has said of the rollout."""
         target = seen.to_go if self.horizon >= seen.reward.shape[-1] else seen.bootstrapped(seen.beyond)
         written = {"advantage": ESTIMATORS[self.estimator](seen), "value_target": target, "value": seen.value}
         for name, column in written.items():
@@ -129,6 +132,7 @@ class GPValueEstimator(ValueEstimatorBase):
             tensordict.set(getattr(self.tensor_keys, name), column.unsqueeze(-1).to(dtype))
         return tensordict
 
+    @torch.no_grad()
     def evaluate(self, tensordict: TensorDictBase) -> Evaluation:
         """What the critic and the policy say of a rollout, in float64."""
         critic, policy, keys = self.critic, self.policy, self.tensor_keys

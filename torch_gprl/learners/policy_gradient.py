@@ -1,71 +1,26 @@
-"""REINFORCE with a Gaussian-process critic: the thesis' Claim 1 as a loop.
+"""Policy gradients with a Gaussian-process critic: the thesis' Claims 1 and 2 as a loop.
 
-One update: collect a rollout, weigh its actions by (.7) with the critic as it stood before, step the policy,
-teach the critic. All learners at once, each on its own experience.
+One update: collect a rollout, weigh its actions with the critic as it stood before, step the policy, teach
+the critic. All learners at once, each on its own experience.
 """
 
+import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv
 
-from torch_gprl.critics import GPActionValue, k_step_returns
-from torch_gprl.gp import SparseOnlineGP, fit_hyperparameters
-from torch_gprl.kernels import SquaredExponential
-from torch_gprl.objectives import PolicyGradientLoss, natural_step
+from torch_gprl.critics import USE_ALL_ACTIONS, Evaluation, GPValueEstimator
+from torch_gprl.learners.config import PolicyGradientConfig
+from torch_gprl.learners.teaching import Teacher, make_critic
+from torch_gprl.objectives import AllActionLoss, PolicyGradientLoss, natural_step
 from torch_gprl.policies import Controller, LinearController, MLPController, RBFController, gaussian_policy
 
-FIT_POINTS = 160  # points of a rollout that a fit of hyper-parameters sees; its cost is cubic in them
-FIRST_FIT, LATER_FITS = 50, 20  # steps of the optimiser: later fits start from the last
 FISHER_EVERY = 4  # one step in four of a rollout enters the Fisher matrix
-FIRST_NOISE = 0.05  # noise variance of standardised targets before the first fit
-
-ControllerForm = Literal["linear", "rbf", "mlp"]
-Optimiser = Literal["natural", "adam"]
-
-
-@dataclass(frozen=True)
-class PolicyGradientConfig:
-    """Policy gradients with a Gaussian-process critic."""
-
-    total_frames: int = 240_000  # environment steps per learner, over all its environments
-    rollout_steps: int = 200  # steps of each environment between two policy updates
-    discount: float = 0.98  # γ per environment step, from 0 to 1
-    horizon: int = 200  # real rewards before the critic's value takes over in (.7); 0 is the critic alone
-    baseline: bool = True  # subtract Q(s, f(s)), the critic's value of the controller's own action
-    controller: ControllerForm = "mlp"  # form of the controller f(s)
-    std: float = 0.5  # initial exploration standard deviation, in halves of the actuator's range
-    optimiser: Optimiser = "natural"  # natural gradient in a trust region, or Adam
-    trust_region: float = 0.02  # KL divergence of the first natural step, nats; falls linearly to 0
-    learning_rate: float = 0.01  # of Adam; falls linearly to 0
-    budget: int = 150  # basis vectors of the critic
-    novelty_threshold: float = 0.3  # novelty that makes a point a basis vector, in noise variances
-    renew_every: int = 20  # policy updates between two renewals of the critic, which forget older data
-
-    def __post_init__(self) -> None:
-        """Refuse numbers out of range.
-
-        Raises:
-            ValueError: naming the field, its value and what would be valid.
-        """
-        for name in ("total_frames", "rollout_steps", "budget", "renew_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("std", "trust_region", "learning_rate"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if not 0 <= self.discount <= 1:
-            raise ValueError(f"discount must lie between 0 and 1, got {self.discount}")
-        if self.horizon < 0:
-            raise ValueError(f"horizon must be at least 0 steps, got {self.horizon}")
-        for name, choices in (("controller", get_args(ControllerForm)), ("optimiser", get_args(Optimiser))):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
 
 
 class PolicyGradient:
@@ -96,20 +51,32 @@ class PolicyGradient:
         self.policy = gaussian_policy(controller, env.action_spec, config.std, seed, learners=indices).to(
             env.device
         )
-        self.critic = self._make_critic(sum(dims)).to(env.device)
-        self.loss = PolicyGradientLoss(self.policy)
-        self.adam = torch.optim.Adam(self.policy.parameters(), lr=config.learning_rate)
+        self.critic = make_critic(self.policy, config, self.learners).to(env.device)
+        self.teacher = Teacher(self.critic, self.policy, config)
+        self.value_estimator = GPValueEstimator(
+            self.critic, self.policy, config.discount, config.estimator, config.horizon, config.trace
+        )
+        self.losses = self._losses()
+        if config.exploration != "learned":
+            self.policy.head.log_std.requires_grad_(False)
+        kind = torch.optim.Adam if config.optimiser == "adam" else torch.optim.SGD
+        self.optimiser = kind(self._trained(), lr=config.learning_rate)
         self.frames_per_update = num_envs * config.rollout_steps
         self.total_updates = -(-config.total_frames // self.frames_per_update)
         self.updates = 0
         self._last_return = torch.full((self.learners,), torch.nan, device=env.device)
 
-    def _make_critic(self, dims: int) -> GPActionValue:
-        config, head = self.config, self.policy.head
-        kernel = SquaredExponential(dims, batch_shape=(self.learners,))
-        gp = SparseOnlineGP(kernel, config.budget, FIRST_NOISE, config.novelty_threshold)
-        low, high = head.centre - head.half_range, head.centre + head.half_range
-        return GPActionValue(gp, action_low=low, action_high=high)
+    def _losses(self) -> list[PolicyGradientLoss | AllActionLoss]:
+        """The terms of the objective: sampled scores, all actions in closed form, or both."""
+        losses: list[PolicyGradientLoss | AllActionLoss] = []
+        if self.config.estimator != "all-action":
+            losses.append(PolicyGradientLoss(self.policy))
+        if self.config.estimator in USE_ALL_ACTIONS:
+            losses.append(AllActionLoss(self.policy, self.critic))
+        return losses
+
+    def _trained(self) -> list[torch.nn.Parameter]:
+        return [parameter for parameter in self.policy.parameters() if parameter.requires_grad]
 
     @property
     def frames(self) -> int:
@@ -123,22 +90,24 @@ class PolicyGradient:
             for rollout in collector:
                 if self.updates == 0:
                     self._standardise(rollout)
-                self._weigh(rollout)
-                if self.updates == 0:  # an empty critic is no baseline: the first rollout serves as its own
-                    self._teach(rollout)
+                seen = self._weigh(rollout)
+                # an empty critic is no baseline: the first rollout serves as its own
+                taught = self.config.in_sample or self.updates == 0
+                if taught:
+                    self.teacher.teach(rollout, self.updates)
                     self._weigh(rollout)
-                gradient_norm = self._step_policy(rollout)
-                if self.updates > 0:
-                    self._teach(rollout)
+                step = self._step_policy(rollout)
+                if not taught:
+                    self.teacher.teach(rollout, self.updates)
                 self.updates += 1
-                yield self._figures(rollout, gradient_norm)
+                yield self._figures(rollout, seen) | step
         finally:
             collector.shutdown(close_env=False)
 
     def _collector(self) -> Collector:
         per_update = self.learners * self.frames_per_update
         return Collector(
-            TransformedEnv(self.env, RewardSum()),
+            TransformedEnv(self.env, Compose(RewardSum(), StepCounter())),  # pyright: ignore[reportCallIssue]
             self.policy,
             frames_per_batch=per_update,
             total_frames=per_update * (self.total_updates - self.updates),
@@ -153,62 +122,48 @@ class PolicyGradient:
         self.policy.head.controller.standardise(observation.mean(1), torch.where(std > 1e-6, std, 1.0))
 
     @torch.no_grad()
-    def _weigh(self, rollout: TensorDictBase) -> None:
-        """Write `value_target`, the returns of (.7), and `advantage`, the weights w_t of the scores."""
-        observation, action = rollout.get("observation"), rollout.get("action")
-        done, terminated = (rollout.get(("next", key)).squeeze(-1) for key in ("done", "terminated"))
-        taken = self.critic.mean_value(observation, action)  # Q(s_t, a_t)
-        ending = self._state_value(rollout.get(("next", "observation")))
-        last = done.clone()
-        last[..., -1] = True
-        following = torch.where(last, ending, torch.cat([taken[..., 1:], ending[..., -1:]], -1))
-        following = torch.where(
-            terminated, 0.0, following
-        )  # nothing follows a terminal state; a time limit is none
-        reward = rollout.get(("next", "reward")).squeeze(-1).to(taken.dtype)
-        target = k_step_returns(reward, following, done, self.config.discount, max(self.config.horizon, 1))
-        weight = target if self.config.horizon > 0 else taken
-        if self.config.baseline:
-            value = self._state_value(observation)
-            weight = weight - value
-            rollout.set("state_value", value.unsqueeze(-1))
-        rollout.set("value_target", target.unsqueeze(-1)).set("advantage", weight.unsqueeze(-1))
+    def _weigh(self, rollout: TensorDictBase) -> Evaluation:
+        """Write `value_target` and `advantage`, the weights w_t of the scores; returns what was seen."""
+        seen = self.value_estimator.evaluate(rollout)
+        self.value_estimator.write(rollout, seen)
+        if self.config.discount_states:
+            weight = self.config.discount ** rollout.get("step_count").to(seen.value.dtype)  # γ^t
+            rollout.set("state_weight", weight)
+            rollout.set("advantage", weight * rollout.get("advantage"))
+        return seen
 
-    def _state_value(self, observation: Tensor) -> Tensor:
-        """Q(s, f(s)) [learners, ...]."""
-        return self.critic.mean_value(observation, self.policy.head.parameters_at(observation)[0])
-
-    def _step_policy(self, rollout: TensorDictBase) -> Tensor:
-        """One step along the gradient of all learners; returns the norm of each one's gradient."""
-        parameters = list(self.policy.parameters())
-        self.adam.zero_grad()
-        self.loss(rollout)["loss_objective"].backward()
-        norm = torch.stack([p.grad.flatten(1).norm(dim=1) for p in parameters if p.grad is not None]).norm(
-            dim=0
-        )
-        left = 1 - self.updates / self.total_updates
-        if self.config.optimiser == "adam":
-            self.adam.param_groups[0]["lr"] = self.config.learning_rate * left
-            self.adam.step()
-        else:
+    def _step_policy(self, rollout: TensorDictBase) -> dict[str, Tensor]:
+        """One step along the gradient of all learners; figures of each one's gradient."""
+        parameters, left = self._trained(), 1 - self.updates / self.total_updates
+        figures = self._differentiate(rollout, parameters)
+        if self.config.optimiser == "natural":
             natural_step(parameters, self._divergence(rollout), self.config.trust_region * left)
-        return norm
+        else:
+            self.optimiser.param_groups[0]["lr"] = self.config.learning_rate * left
+            self.optimiser.step()
+        if self.config.exploration == "scheduled":
+            done = (self.updates + 1) / self.total_updates
+            std = self.config.std + done * (self.config.final_std - self.config.std)
+            self.policy.head.log_std.data.fill_(math.log(std))
+        return figures
 
-    def _teach(self, rollout: TensorDictBase) -> None:
-        """Let the critic absorb the rollout; renew it at updates 0, 1, 2, 4, ... and every `renew_every`."""
-        young = self.updates & (self.updates - 1) == 0  # a power of two: values change fast at first
-        if self.updates % self.config.renew_every == 0 or (young and self.updates < self.config.renew_every):
-            self._renew(rollout)
-        self.critic.update(rollout, stamp=self.updates)
+    def _differentiate(
+        self, rollout: TensorDictBase, parameters: list[torch.nn.Parameter]
+    ) -> dict[str, Tensor]:
+        """Set the gradient, half of the environments at a time; its norm and the cosine between the halves.
 
-    def _renew(self, rollout: TensorDictBase) -> None:
-        """Forget, and set scaling and hyper-parameters by this rollout."""
-        data = rollout.get("observation"), rollout.get("action")
-        self.critic.standardise(*data, rollout.get("value_target"))
-        inputs, targets = self.critic.inputs(*data), self.critic.standard_targets(rollout.get("value_target"))
-        chosen = torch.linspace(0, inputs.shape[1] - 1, min(FIT_POINTS, inputs.shape[1])).long()
-        steps = FIRST_FIT if self.updates == 0 else LATER_FITS
-        fit_hyperparameters(self.critic.gp, inputs[:, chosen], targets[:, chosen], steps)
+        The cosine says what is signal and what is noise; it is NaN with one environment.
+        """
+        total, gradients = rollout.shape[1], []
+        self.optimiser.zero_grad()
+        for half in rollout.chunk(2, dim=1):
+            before = _gradient(parameters)
+            loss = sum(next(iter(term(half).values())) for term in self.losses)
+            (loss * (half.shape[1] / total)).backward()
+            gradients.append(_gradient(parameters) - before)
+        one, other = gradients[0], gradients[-1]
+        cosine = torch.cosine_similarity(one, other, dim=1) if len(gradients) == 2 else one[:, 0] * torch.nan
+        return {"gradient_norm": _gradient(parameters).norm(dim=1), "gradient_cosine": cosine}
 
     def _divergence(self, rollout: TensorDictBase) -> Callable[[], Tensor]:
         """Mean KL(π_now ‖ π_θ) over states of the rollout [learners], a function of the parameters θ."""
@@ -225,20 +180,23 @@ class PolicyGradient:
         return divergence
 
     @torch.no_grad()
-    def _figures(self, rollout: TensorDictBase, gradient_norm: Tensor) -> dict[str, Tensor]:
+    def _figures(self, rollout: TensorDictBase, seen: Evaluation) -> dict[str, Tensor]:
+        """Figures of the rollout, and of the critic as it stood before it, [learners] each."""
         ended = rollout.get(("next", "done")).squeeze(-1).flatten(1)
         returns = rollout.get(("next", "episode_reward")).squeeze(-1).flatten(1)
         mean = (returns * ended).sum(1) / ended.sum(1)
         self._last_return = torch.where(
             ended.any(1), mean, self._last_return
         )  # no episode ended: the last known
-        target, weight = rollout.get("value_target").flatten(1), rollout.get("advantage").flatten(1)
+        error = (seen.to_go - seen.taken).flatten(1)
+        surprise = (seen.to_go - seen.value).flatten(1)
         return {
             "return": self._last_return,
             "sigma": self.policy.std.mean(-1),
             "basis_size": self.critic.gp.size.clone(),
-            "explained_variance": 1 - weight.var(1) / target.var(1),
-            "gradient_norm": gradient_norm,
+            "outdated": self.teacher.outdated(),
+            "value_error": error.square().mean(1).sqrt(),
+            "explained_variance": 1 - surprise.var(1) / seen.to_go.flatten(1).var(1),
         }
 
     def state_dict(self) -> dict[str, Any]:
@@ -247,8 +205,8 @@ class PolicyGradient:
         return {
             "updates": self.updates,
             "policy": self.policy.state_dict(),
-            "critic": self.critic.state_dict(),
-            "adam": self.adam.state_dict(),
+            "teacher": self.teacher.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
             "noise": self.policy.noise.state(),
             "last_return": self._last_return,
         }
@@ -258,10 +216,16 @@ class PolicyGradient:
         assert self.policy.noise is not None
         self.updates = state["updates"]
         self.policy.load_state_dict(state["policy"])
-        self.critic.load_state_dict(state["critic"])
-        self.adam.load_state_dict(state["adam"])
+        self.teacher.load_state_dict(state["teacher"])
+        self.optimiser.load_state_dict(state["optimiser"])
         self.policy.noise.restore(state["noise"])
         self._last_return = state["last_return"]
+
+
+def _gradient(parameters: list[torch.nn.Parameter]) -> Tensor:
+    """The gradients as one vector for each learner [learners, P]; 0 where there is none yet."""
+    parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+    return torch.cat([part.flatten(1) for part in parts], 1).clone()
 
 
 def _controller(kind: str, observation_dim: int, action_dim: int, learners: range, seed: int) -> Controller:

@@ -1,0 +1,91 @@
+"""The numbers of policy-gradient learning, each with its unit: they become the command line."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from torch_gprl.critics import EstimatorName
+
+ControllerForm = Literal["linear", "rbf", "mlp"]
+Optimiser = Literal["natural", "adam", "plain"]
+Exploration = Literal["learned", "fixed", "scheduled"]
+Targets = Literal["returns", "differences"]
+AgeForm = Literal["exponential", "logit"]
+
+CHOICES = {
+    "estimator": EstimatorName,
+    "controller": ControllerForm,
+    "optimiser": Optimiser,
+    "exploration": Exploration,
+    "targets": Targets,
+    "age_form": AgeForm,
+}
+LEAST = {"total_frames": 1, "rollout_steps": 1, "budget": 1, "renew_every": 1, "horizon": 0, "replay": 0}
+POSITIVE = (
+    "std",
+    "final_std",
+    "trust_region",
+    "learning_rate",
+    "noise",
+    "lengthscale",
+    "action_lengthscale",
+    "age_timescale",
+)
+SHARES = ("discount", "trace", "age_weight")
+
+
+@dataclass(frozen=True)
+class PolicyGradientConfig:
+    """Policy gradients with a Gaussian-process critic."""
+
+    total_frames: int = 240_000  # environment steps per learner, over all its environments
+    rollout_steps: int = 200  # steps of each environment between two policy updates
+    discount: float = 0.98  # γ per environment step, from 0 to 1
+    discount_states: bool = False  # weigh step t of an episode by γ^t, the gradient of the discounted return
+
+    estimator: EstimatorName = "k-step-baseline"  # how good an action was; torch_gprl.critics.estimators
+    horizon: int = 200  # real rewards before the critic's value takes over, in the k-step estimators
+    trace: float = 0.95  # λ of the estimator "generalised", from 0 to 1
+
+    controller: ControllerForm = "mlp"  # form of the controller f(s)
+    std: float = 0.5  # initial exploration standard deviation, in halves of the actuator's range
+    exploration: Exploration = "learned"  # of the standard deviation; scheduled goes in equal steps
+    final_std: float = 0.1  # where the scheduled standard deviation ends, in halves of the actuator's range
+    optimiser: Optimiser = "natural"  # natural gradient in a trust region, Adam, or the plain gradient
+    trust_region: float = 0.02  # KL divergence of the first natural step, nats; falls linearly to 0
+    learning_rate: float = 0.01  # of Adam and of the plain gradient; falls linearly to 0
+
+    targets: Targets = "returns"  # the critic learns values from returns, or rewards as temporal differences
+    in_sample: bool = False  # the critic learns a rollout before it judges it
+    budget: int = 150  # basis vectors of the critic
+    novelty_threshold: float = 0.3  # novelty that makes a point a basis vector, in noise variances
+    renew_every: int = 20  # policy updates between renewals of the critic, which forget older data; 1: each
+    replay: int = 0  # environment steps per learner, solved anew at each update; differences only, 0 is off
+    noise: float = 0.1  # noise variance of temporal differences, in variances of the reward
+    lengthscale: float = 0.5  # of observations, in their standard deviations times √columns; differences
+    action_lengthscale: float = 12.0  # of actions, in their standard deviations; differences
+    age_weight: float = 0.0  # λ: pruning by information (0) or by age (1)
+    age_form: AgeForm = "exponential"  # of the age in the pruning score
+    age_timescale: float = 10.0  # policy updates in which the exponential form falls to 1/e
+
+    def __post_init__(self) -> None:
+        """Refuse numbers out of range.
+
+        Raises:
+            ValueError: naming the field, its value and what would be valid.
+        """
+        for name, least in LEAST.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        for name in POSITIVE:
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in SHARES:
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must lie between 0 and 1, got {getattr(self, name)}")
+        for name, kind in CHOICES.items():
+            if getattr(self, name) not in get_args(kind):
+                choices = ", ".join(get_args(kind))
+                raise ValueError(f"{name} must be one of {choices}, got {getattr(self, name)!r}")
+        if self.replay and self.targets != "differences":
+            raise ValueError("replay solves temporal differences anew and needs targets 'differences'")

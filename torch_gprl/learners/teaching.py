@@ -1,0 +1,125 @@
+"""How the critic of a policy-gradient learner is taught: targets, renewal, replay, pruning (Claim 2).
+
+A critic lives through policy updates. What it learned under older policies is out of date, and is forgotten
+by renewal, by pruning that prefers young basis vectors, or by solving the temporal differences of a replay
+buffer anew under today's policy.
+"""
+
+import math
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from torch_gprl.critics import GPActionValue
+from torch_gprl.gp import AgeAwareScore, InformationScore, SparseOnlineGP, fit_hyperparameters
+from torch_gprl.kernels import SquaredExponential
+from torch_gprl.learners.config import PolicyGradientConfig
+from torch_gprl.policies import GaussianPolicy
+
+FIT_POINTS = 160  # points of a rollout that a fit of hyper-parameters sees; its cost is cubic in them
+FIRST_FIT, LATER_FITS = 50, 20  # steps of the optimiser: later fits start from the last
+FIRST_NOISE = 0.05  # noise variance of standardised targets before the first fit
+REMEMBERED = (
+    "observation",
+    "action",
+    ("next", "observation"),
+    ("next", "reward"),
+    ("next", "terminated"),
+)
+
+
+def make_critic(policy: GaussianPolicy, config: PolicyGradientConfig, learners: int) -> GPActionValue:
+    """An empty critic of a policy, one Gaussian process for each learner."""
+    head = policy.head
+    states, actions = head.controller.observation_dim, head.controller.action_dim
+    lengthscale = torch.full((states + actions,), config.action_lengthscale, dtype=torch.float64)
+    lengthscale[:states] = config.lengthscale * math.sqrt(states)
+    if config.targets == "returns":  # fitted from the first rollout on
+        lengthscale.fill_(1)
+    kernel = SquaredExponential(states + actions, lengthscale, batch_shape=(learners,))
+    pruning = InformationScore()
+    if config.age_weight:
+        pruning = AgeAwareScore(config.age_weight, config.age_form, config.age_timescale)
+    kernel.requires_grad_(config.targets == "returns")
+    gp = SparseOnlineGP(kernel, config.budget, FIRST_NOISE, config.novelty_threshold, pruning=pruning)
+    low, high = head.centre - head.half_range, head.centre + head.half_range
+    return GPActionValue(gp, action_low=low, action_high=high)
+
+
+class Teacher:
+    """Teaches the critic rollout by rollout.
+
+    Args:
+        critic: what is taught.
+        policy: whose values it should learn.
+        config: targets, renewal, replay.
+    """
+
+    def __init__(self, critic: GPActionValue, policy: GaussianPolicy, config: PolicyGradientConfig) -> None:
+        self.critic, self.policy, self.config = critic, policy, config
+        self.replay: TensorDictReplayBuffer | None = None
+        if config.replay:
+            self.replay = TensorDictReplayBuffer(storage=LazyTensorStorage(config.replay))
+
+    def teach(self, rollout: TensorDictBase, update: int) -> None:
+        """Absorb a rollout that carries `value_target`, [learners, envs, T], made at policy update `update`.
+
+        Renews the critic first, at updates 0, 1, 2, 4, ... and every `renew_every`.
+        """
+        config = self.config
+        young = update & (update - 1) == 0  # a power of two: values change fast at first
+        if update % config.renew_every == 0 or (young and update < config.renew_every):
+            self._renew(rollout, update)
+        if config.targets == "returns":
+            self.critic.update(rollout, stamp=update)
+        elif self.replay is None:
+            self.critic.update_differences(rollout, self.policy, config.discount, stamp=update)
+        else:
+            self.replay.extend(rollout.select(*REMEMBERED).reshape(rollout.shape[0], -1).transpose(0, 1))
+            self.critic.resolve(self._remembered(self.replay), self.policy, config.discount, stamp=update)
+
+    def _renew(self, rollout: TensorDictBase, update: int) -> None:
+        """Forget, and set scaling and hyper-parameters by this rollout."""
+        critic, gp = self.critic, self.critic.gp
+        data = rollout.get("observation"), rollout.get("action")
+        critic.standardise(*data, rollout.get("value_target"))
+        if self.config.targets == "differences":
+            reward = rollout.get(("next", "reward")).flatten(1).to(gp.basis.dtype)
+            # rewards without spread would leave no noise at all
+            variance = (reward.var(1) / critic.target_scale.square()).clamp_min(1e-6)
+            with torch.no_grad():
+                gp.log_noise_variance.copy_((self.config.noise * variance).log())
+            return
+        inputs, targets = critic.inputs(*data), critic.standard_targets(rollout.get("value_target"))
+        chosen = torch.linspace(0, inputs.shape[1] - 1, min(FIT_POINTS, inputs.shape[1])).long()
+        steps = FIRST_FIT if update == 0 else LATER_FITS
+        fit_hyperparameters(gp, inputs[:, chosen], targets[:, chosen], steps)
+
+    @staticmethod
+    def _remembered(replay: TensorDictReplayBuffer) -> TensorDictBase:
+        """All transitions of a buffer, [learners, steps]."""
+        stored = replay[:]
+        assert isinstance(stored, TensorDictBase)
+        return stored.transpose(0, 1)
+
+    def outdated(self) -> Tensor:
+        """Share of basis vectors older than the newest experience [learners]."""
+        gp = self.critic.gp
+        return ((gp.stamps < gp.clock) & gp.mask).sum(-1) / gp.size.clamp_min(1)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Critic and replay."""
+        return {
+            "critic": self.critic.state_dict(),
+            "replay": None if self.replay is None or not len(self.replay) else self.replay[:].to_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what `state_dict` gave."""
+        self.critic.load_state_dict(state["critic"])
+        if self.replay is not None and state["replay"] is not None:
+            self.replay.empty()
+            self.replay.extend(state["replay"])

@@ -70,7 +70,7 @@ class BatchEnv(EnvBase):
         self, qpos: Float[Tensor, "learners num_envs nq"], qvel: Float[Tensor, "learners num_envs nv"]
     ) -> TensorDict:
         """Start new episodes in the given states; returns what `reset` would."""
-        self._copies.place(qpos.flatten(0, 1), qvel.flatten(0, 1))
+        self._copies.place(qpos.flatten(0, 1).cpu(), qvel.flatten(0, 1).cpu())
         return self._started()
 
     def get_extra_state(self) -> dict[str, Tensor]:

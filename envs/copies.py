@@ -5,6 +5,7 @@ Everything here is flat: B copies over the simulator's one array, float64, on th
 
 import math
 import os
+import warnings
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from envs.noise import StepNoise
-from envs.physics import State
+from envs.physics import Divergence, State
 from envs.streams import StartDraws, Streams
 from envs.task import Task
 
@@ -170,15 +171,28 @@ class Copies:
         before = self._physics.advance()
         if "velocity" in self._noise:
             self.state.qvel.add_(self._noise["velocity"].now)
-        diverged = self._physics.diverged()
-        if diverged is not None:
-            self.divergences += int(diverged.sum())
-            self._physics.restore(diverged)
+        divergence = self._physics.diverged()
+        if divergence is not None:
+            self._undo(divergence)
         reward, parts = self.task.reward(before, applied, self.state)
         terminated = self.task.terminated(self.state)
-        if diverged is not None:
-            terminated = terminated | diverged
+        if divergence is not None:
+            terminated = terminated | divergence.copies
         return Step(self.observation(), reward, parts, terminated, self._steps >= self._horizon)
+
+    def _undo(self, divergence: Divergence) -> None:
+        """Put lost simulations back into their last good state, count them, and warn of the first."""
+        if not self.divergences:
+            learner, env = divmod(int(divergence.copies.int().argmax()), self.options.num_envs)
+            warnings.warn(
+                f"{self.task.id}: the simulation of learner {learner}, environment {env} diverged with "
+                f"{divergence.reason}; such episodes end as terminated and are counted in `divergences`. "
+                f"Smaller actions or less noise may help",
+                RuntimeWarning,
+                stacklevel=4,
+            )
+        self.divergences += int(divergence.copies.sum())
+        self._physics.restore(divergence.copies)
 
 
 def _threads(threads: int | None, copies: int) -> int:

@@ -25,11 +25,12 @@ from torch import Tensor
 from envs.models import stripped
 
 LARGEST = 1e10  # beyond it MuJoCo calls a state divergent (mjMAXVAL)
-BAD_STATE = [
-    int(mujoco.mjtWarning.mjWARN_BADQPOS),
-    int(mujoco.mjtWarning.mjWARN_BADQVEL),
-    int(mujoco.mjtWarning.mjWARN_BADQACC),
-]
+TOO_LARGE = f"a number that is not finite or beyond {LARGEST:g}"
+BAD_STATE = {  # what makes MuJoCo reset a simulation
+    int(mujoco.mjtWarning.mjWARN_BADQPOS): "a bad position",
+    int(mujoco.mjtWarning.mjWARN_BADQVEL): "a bad velocity",
+    int(mujoco.mjtWarning.mjWARN_BADQACC): "a bad acceleration",
+}
 
 
 class State(NamedTuple):
@@ -44,6 +45,18 @@ class State(NamedTuple):
     qpos: Tensor
     qvel: Tensor
     derived: Mapping[str, Tensor] = {}
+
+
+class Divergence(NamedTuple):
+    """Simulations that were lost.
+
+    Attributes:
+        copies: [B] which.
+        reason: what went wrong in the first of them.
+    """
+
+    copies: Tensor
+    reason: str
 
 
 class Physics(abc.ABC):
@@ -76,8 +89,8 @@ class Physics(abc.ABC):
         """Put the copies `rows` into new states and forget their past."""
 
     @abc.abstractmethod
-    def diverged(self) -> Bool[Tensor, " B"] | None:
-        """Where the last step ended in no usable state, or None where all is well."""
+    def diverged(self) -> Divergence | None:
+        """Where and why the last step ended in no usable state, or None where all is well."""
 
     @abc.abstractmethod
     def restore(self, rows: Bool[Tensor, " B"]) -> None:
@@ -152,16 +165,19 @@ class MujocoPhysics(Physics):
         self.qvel[index] = qvel
         self.batch.forward(rows)
 
-    def diverged(self) -> Bool[Tensor, " B"] | None:
+    def diverged(self) -> Divergence | None:
         """Where MuJoCo had to reset a copy, or left it beyond `LARGEST`; see `Physics.diverged`."""
         # A sum of squares within the bound's square proves all entries within the bound; NaN fails the test.
         state = self.batch.state
         if np.vdot(state, state) <= LARGEST**2 and not self.batch.warning.any():
             return None
-        bad = (self.batch.warning[:, BAD_STATE, 1] > 0).any(axis=1)
+        lost = np.stack([self.batch.warning[:, warning, 1] > 0 for warning in BAD_STATE])
         self.batch.warning[:] = 0
-        bad |= ~(np.abs(state).max(axis=1) <= LARGEST)
-        return torch.from_numpy(bad) if bad.any() else None
+        bad = lost.any(axis=0) | ~(np.abs(state).max(axis=1) <= LARGEST)
+        if not bad.any():
+            return None
+        reasons = np.array(list(BAD_STATE.values()))[lost[:, bad.argmax()]]
+        return Divergence(torch.from_numpy(bad), reasons[0] if len(reasons) else TOO_LARGE)
 
     def restore(self, rows: Bool[Tensor, " B"]) -> None:
         """Put back the state before the last step; see `Physics.restore`."""
@@ -208,11 +224,11 @@ class TorchPhysics(Physics):
         self.qpos[index] = qpos
         self.qvel[index] = qvel
 
-    def diverged(self) -> Bool[Tensor, " B"] | None:
+    def diverged(self) -> Divergence | None:
         """Where a number is not finite or beyond `LARGEST`; see `Physics.diverged`."""
         if self.rows.abs().max() <= LARGEST:  # NaN fails the test
             return None
-        return ~(self.rows.abs().amax(dim=1) <= LARGEST)
+        return Divergence(~(self.rows.abs().amax(dim=1) <= LARGEST), TOO_LARGE)
 
     def restore(self, rows: Bool[Tensor, " B"]) -> None:
         """Put back the state before the last step; see `Physics.restore`."""

@@ -8,9 +8,7 @@ disable) overrides the choice.
 # pyright: reportAttributeAccessIssue=false
 # (mujoco takes its names from compiled modules, which pyright cannot read)
 
-import ctypes
 import importlib
-import os
 import warnings
 
 import mujoco
@@ -19,9 +17,9 @@ from numpy.typing import NDArray
 
 from envs.drawing import Sketch
 from envs.models import load
+from envs.opengl import choose_platform
 from envs.task import Task
 
-LIBRARIES = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}  # platform -> what it loads
 MAX_GEOMS = 1000
 CAMERAS = ("view", "track")  # the first of them that a model has is used, else MuJoCo's free camera
 
@@ -41,9 +39,7 @@ class OpenGL:
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
-        platform = os.environ.get("MUJOCO_GL", "").lower() or _platform()
-        if platform not in ("egl", "osmesa", "glfw"):
-            raise OSError(f"MUJOCO_GL={platform}")
+        platform = choose_platform()
         self._gl = importlib.import_module(f"mujoco.{platform}").GLContext(width, height)
         self._gl.make_current()
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
@@ -59,21 +55,6 @@ class OpenGL:
         mujoco.mjr_render(self._viewport, scene, self._context)
         mujoco.mjr_readPixels(pixels, None, self._viewport, self._context)
         return pixels[::-1].copy()  # OpenGL's first row is the lowest
-
-
-def _platform() -> str:
-    """The first platform whose library loads.
-
-    Raises:
-        OSError: if none does.
-    """
-    for platform, library in LIBRARIES.items():
-        try:
-            ctypes.CDLL(library)
-        except OSError:
-            continue
-        return platform
-    raise OSError(f"neither {' nor '.join(LIBRARIES.values())} can be loaded")
 
 
 class Picture:

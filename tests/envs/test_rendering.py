@@ -1,16 +1,18 @@
 """Pictures, with OpenGL and without: right size, and showing what moved."""
 
 import math
+import os
+import subprocess
+import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 import envs
-from envs import rendering
-
-RED = slice(0, 1)
+from envs import opengl
 
 
 def opengl_works() -> bool:
@@ -69,6 +71,17 @@ def test_without_opengl_one_warning_names_what_to_install(monkeypatch):
 
 def test_missing_libraries_lead_to_a_sketch(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(rendering, "LIBRARIES", {"egl": "libNothing.so.1"})
+    monkeypatch.setattr(opengl, "LIBRARIES", {"egl": "libNothing.so.1"})
     with pytest.warns(UserWarning, match="libNothing"):
         assert picture(0.0).float().std() > 1
+
+
+@pytest.mark.parametrize("platform", ["egl", "osmesa", "disable", ""])
+def test_no_choice_of_opengl_breaks_the_import(platform):
+    """MuJoCo's own import fails where MUJOCO_GL names a library that is missing."""
+    program = (
+        "import envs; env = envs.make('crane'); env.reset(); print(env.render(width=32, height=32).shape)"
+    )
+    environment = os.environ | {"MUJOCO_GL": platform, "PYTHONPATH": str(Path(envs.__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    assert done.stdout.strip() == "torch.Size([32, 32, 3])", done.stderr

@@ -37,7 +37,9 @@ def state(gp: SparseOnlineGP) -> Whitened:
 
 def seen_by_a_score(gp: SparseOnlineGP) -> BasisStatistics:
     gp.refresh()
-    return basis_statistics(gp, int(gp.size))
+    rows = int(gp.size)
+    used = Whitened(gp.gram_factor[:rows, :rows], gp.precision[:rows, :rows], gp.information[:rows])
+    return basis_statistics(used, gp.stamps[:rows], gp.mask[:rows])
 
 
 def values(whitened: Whitened) -> tuple[Tensor, Tensor]:

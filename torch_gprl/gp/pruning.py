@@ -17,7 +17,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torch_gprl.gp.whitened import WhitenedState
 from torch_gprl.linalg import cholesky
 
 
@@ -31,18 +30,27 @@ class BasisStatistics(NamedTuple):
     mask: Bool[Tensor, "*batch B"]
 
 
-def basis_statistics(state: WhitenedState, rows: int) -> BasisStatistics:
-    """Statistics of the first `rows` rows of a refreshed state, [*batch, rows] each."""
-    used = slice(rows)
-    factor = state.gram_factor[..., used, used]
-    eye = torch.eye(rows, dtype=factor.dtype, device=factor.device)
-    inverse_factor = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
-    half = torch.linalg.solve_triangular(state.precision_factor[..., used, used], inverse_factor, upper=False)
-    alpha = (inverse_factor.mT @ state.weights[..., used, None]).squeeze(-1)  # L⁻ᵀA⁻¹b
-    square = inverse_factor.square().sum(-2)
-    return BasisStatistics(
-        alpha, square, half.square().sum(-2), state.stamps[..., used], state.mask[..., used]
+class Whitened(NamedTuple):
+    """The state of a sparse GP that a deletion rewrites; see the module's table."""
+
+    gram_factor: Float[Tensor, "*batch B B"]
+    precision: Float[Tensor, "*batch B B"]
+    information: Float[Tensor, "*batch B"]
+
+
+def basis_statistics(
+    state: Whitened, stamps: Int[Tensor, "*batch B"], mask: Bool[Tensor, "*batch B"]
+) -> BasisStatistics:
+    """What a score sees of a basis, [*batch, B] each."""
+    eye = torch.eye(stamps.shape[-1], dtype=state.precision.dtype, device=stamps.device)
+    inverse_factor = torch.linalg.solve_triangular(
+        state.gram_factor, eye.expand_as(state.gram_factor), upper=False
     )
+    precision_factor = cholesky(state.precision)
+    half = torch.linalg.solve_triangular(precision_factor, inverse_factor, upper=False)
+    weights = torch.cholesky_solve(state.information.unsqueeze(-1), precision_factor)
+    alpha = (inverse_factor.mT @ weights).squeeze(-1)  # L⁻ᵀA⁻¹b
+    return BasisStatistics(alpha, inverse_factor.square().sum(-2), half.square().sum(-2), stamps, mask)
 
 
 @runtime_checkable
@@ -139,14 +147,6 @@ class AgeAwareScore:
 
 
 LOGIT_EDGE = 0.01  # how near to 0 and 1 the logit form comes
-
-
-class Whitened(NamedTuple):
-    """The state of a sparse GP that a deletion rewrites; see the module's table."""
-
-    gram_factor: Float[Tensor, "*batch B B"]
-    precision: Float[Tensor, "*batch B B"]
-    information: Float[Tensor, "*batch B"]
 
 
 def keep_first(

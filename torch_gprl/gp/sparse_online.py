@@ -186,7 +186,7 @@ class SparseOnlineGP(WhitenedState):
         admitted = rows < self.budget or self.order == "arrival" or (int(self.observations) + 1) % CHURN == 0
         if admitted and novelty > max(self.novelty_threshold * noise, floor):
             phi = torch.cat([phi, phi.new_full((1, 1), math.sqrt(novelty))])
-            self._write_rows(phi.mT, point, rows)
+            self._append(phi.mT, point, rows)
             novelty, rows = 0.0, rows + 1
         weight = 1 / (noise + novelty) if self.projection == "moment" else 1 / noise
         self.precision[:rows, :rows].addmm_(phi, phi.mT, alpha=weight)
@@ -206,10 +206,11 @@ class SparseOnlineGP(WhitenedState):
         scaled = phi * weight.sqrt().unsqueeze(-2)
         weighted = weight * targets
         precision = self.precision[..., : phi.shape[-2], : phi.shape[-2]]
-        if phi.ndim == 2:
-            precision.addmm_(scaled, scaled.mT)
-        else:
+        add_product = {2: precision.addmm_, 3: precision.baddbmm_}.get(phi.ndim)
+        if add_product is None:
             precision.add_(scaled @ scaled.mT)
+        else:
+            add_product(scaled, scaled.mT)
         self.information[..., : phi.shape[-2]].add_((phi @ weighted.unsqueeze(-1)).squeeze(-1))
         quadratic = torch.linalg.vecdot(weighted, targets)
         self.evidence_constant.add_(0.5 * (log_weight.sum(-1) - quadratic - count * LOG_TWO_PI))
@@ -237,42 +238,39 @@ class SparseOnlineGP(WhitenedState):
     def _add(self, selection: Selection, inputs: Tensor, phi: Tensor) -> Tensor:
         """Write the selected points behind the basis in use; returns Φ with its new rows."""
         picks, before = selection.pivots.shape[-1], phi.shape[-2]
-        if not picks:
+        if phi.ndim == 2 and phi.device.type == "cpu":  # one learner, its size known: slices, thrice as fast
+            phi = torch.cat([phi, selection.rows])
+            self._append(phi[:, selection.pivots].mT.tril(before), inputs[selection.pivots], before)
             return phi
-        if phi.ndim == 2 and phi.device.type == "cpu":
-            return self._add_alone(selection, inputs, phi)
-        rows = torch.arange(min(before + picks, self.capacity), device=phi.device)
-        slots = self.size.unsqueeze(-1) + torch.arange(picks, device=phi.device)
-        place = (rows.unsqueeze(-1) == slots.unsqueeze(-2)) & selection.accepted.unsqueeze(-2)  # [*b, R, J]
-        one_hot = place.to(phi.dtype)
-        phi = torch.cat([phi, phi.new_zeros(*phi.shape[:-2], len(rows) - before, phi.shape[-1])], -2)
-        phi = phi + one_hot @ selection.rows
-        index = selection.pivots.unsqueeze(-2).expand(*selection.pivots.shape[:-1], len(rows), picks)
-        below = rows.unsqueeze(-1) <= slots.unsqueeze(-2)
-        # row j of the new part of L is φ of its own point, up to the diagonal; it replaces an identity row
-        columns = phi.gather(-1, index) * below - one_hot
-        used = slice(len(rows))
-        self.gram_factor[..., used, used].add_(one_hot @ columns.mT)
-        wide = selection.pivots.unsqueeze(-1).expand(*selection.pivots.shape, inputs.shape[-1])
-        self.basis[..., used, :].add_(one_hot @ inputs.gather(-2, wide))
-        self.stamps[..., used].copy_(torch.where(place.any(-1), self.clock, self.stamps[..., used]))
+        after = min(before + picks, self.capacity)
+        wide = pad(phi, (0, 0, 0, after - before))
+        if not picks:
+            return wide
+        learner, pick = selection.accepted.reshape(-1, picks).nonzero(as_tuple=True)
+        pivot = selection.pivots.reshape(-1, picks)[learner, pick]
+        slot = self._flat("size")[learner] + pick
+        flat = wide.view(-1, *wide.shape[-2:])
+        flat[learner, slot] = selection.rows.reshape(-1, *selection.rows.shape[-2:])[learner, pick]
+        # the new row of L is φ of the point itself, up to the diagonal
+        below = torch.arange(after, device=phi.device) <= slot.unsqueeze(-1)
+        self._flat("gram_factor")[learner, slot, :after] = flat[learner, :, pivot] * below
+        self._flat("basis")[learner, slot] = inputs.reshape(-1, *inputs.shape[-2:])[learner, pivot]
+        self._flat("stamps")[learner, slot] = self.clock
         self.size.add_(selection.accepted.sum(-1))
-        return phi
+        return wide
 
-    def _add_alone(self, selection: Selection, inputs: Tensor, phi: Tensor) -> Tensor:
-        """`_add` for one learner on the CPU, its size known to the host: slices, not one-hot products."""
-        before = phi.shape[-2]
-        phi = torch.cat([phi, selection.rows])
-        self._write_rows(phi[:, selection.pivots].mT.tril(before), inputs[selection.pivots], before)
-        return phi
-
-    def _write_rows(self, gram_rows: Tensor, points: Tensor, before: int) -> None:
-        """Append new basis vectors of one learner: their rows of L, [J, before + J], and themselves."""
+    def _append(self, gram_rows: Tensor, points: Tensor, before: int) -> None:
+        """Write new basis vectors of the only learner: their rows of L, [J, before + J], and themselves."""
         after = before + len(points)
         self.gram_factor[before:after, :after] = gram_rows
         self.basis[before:after] = points
         self.stamps[before:after] = self.clock
         self.size.fill_(after)
+
+    def _flat(self, name: str) -> Tensor:
+        """A buffer with all batch dimensions as one, the same memory."""
+        buffer = self.get_buffer(name)
+        return buffer.view(-1, *buffer.shape[len(self.batch_shape) :])
 
     def _difference(
         self, phi: Tensor, inputs: Tensor, following: GaussianInputs, discount: Tensor
@@ -296,30 +294,28 @@ class SparseOnlineGP(WhitenedState):
 
     def _prune(self, full: Tensor) -> None:
         """Delete the lowest scores of the learners that are `full` until they are back at their budget."""
-        self.refresh()
-        rows, kept = self._active().rows, slice(self.budget)
-        score = self.pruning(basis_statistics(self, rows)).masked_fill(~self.mask[..., :rows], -torch.inf)
-        ranked = score.argsort(dim=-1, descending=True)
-        order = torch.cat([ranked[..., kept].sort(-1).values, ranked[..., self.budget :]], -1)
-        used = slice(rows)
+        chosen, used = full.reshape(-1).nonzero().squeeze(-1), slice(self._active().rows)
         state = Whitened(
-            self.gram_factor[..., used, used], self.precision[..., used, used], self.information[..., used]
+            self._flat("gram_factor")[chosen, used, used],
+            self._flat("precision")[chosen, used, used],
+            self._flat("information")[chosen, used],
         )
+        basis, stamps = self._flat("basis")[chosen, used], self._flat("stamps")[chosen, used]
+        mask = self.mask.view(-1, self.capacity)[chosen, used]
+        score = self.pruning(basis_statistics(state, stamps, mask)).masked_fill(~mask, -torch.inf)
+        ranked = score.argsort(dim=-1, descending=True)
+        kept = ranked[:, : self.budget].sort(-1).values
+        order = torch.cat([kept, ranked[:, self.budget :]], -1)
         left, evidence = keep_first(state, order, self.budget, self.projection)
-        wide = order[..., kept].unsqueeze(-1).expand(*order.shape[:-1], self.budget, self.basis.shape[-1])
         unused = self.capacity - self.budget
-        pruned = {
-            "basis": pad(self.basis.gather(-2, wide), (0, 0, 0, unused)),
-            "stamps": pad(self.stamps.gather(-1, order[..., kept]), (0, unused)),
-            "gram_factor": _bordered(left.gram_factor, unused),
-            "precision": _bordered(left.precision, unused),
-            "information": pad(left.information, (0, unused)),
-            "evidence_constant": self.evidence_constant + evidence,
-            "size": self.size.clamp_max(self.budget),
-        }
-        for name, new in pruned.items():
-            old = self.get_buffer(name)
-            old.copy_(new.where(full.reshape(full.shape + (1,) * (old.ndim - full.ndim)), old))
+        wide = kept.unsqueeze(-1).expand(*kept.shape, basis.shape[-1])
+        self._flat("basis")[chosen] = pad(basis.gather(1, wide), (0, 0, 0, unused))
+        self._flat("stamps")[chosen] = pad(stamps.gather(1, kept), (0, unused))
+        self._flat("gram_factor")[chosen] = _bordered(left.gram_factor, unused)
+        self._flat("precision")[chosen] = _bordered(left.precision, unused)
+        self._flat("information")[chosen] = pad(left.information, (0, unused))
+        self._flat("evidence_constant")[chosen] += evidence
+        self._flat("size")[chosen] = self.budget
         self._stale = True
 
     @torch.no_grad()

@@ -58,3 +58,13 @@ def test_balancing_earns_one_for_each_step():
 )
 def test_an_episode_ends_off_the_rail_or_fallen(task, start, ends):
     assert after_a_step(task, start, 0.0)[1]["terminated"].item() == ends
+
+
+def test_free_motion_keeps_its_energy():
+    x, θ, speed, ω = simulated("cartpole-swingup", np.array([0.0, 1.5, 0.3, 1.0]), np.zeros((125, 1))).T
+    moment = POLE * HALF
+    kinetic = 0.5 * (CART + POLE) * speed**2 + moment * speed * ω * np.cos(θ) + 2 / 3 * moment * HALF * ω**2
+    energy = kinetic + moment * GRAVITY * np.cos(θ)
+    assert np.ptp(θ) > 2
+    assert np.ptp(x) > 0.05
+    assert np.ptp(energy) < 1e-5

@@ -53,3 +53,13 @@ def test_a_still_load_at_the_goal_is_the_best_there_is():
 )
 def test_an_episode_ends_off_the_rail_or_with_a_slack_rope(start, ends):
     assert after_a_step("crane", start, 0.0)[1]["terminated"].item() == ends
+
+
+def test_free_motion_keeps_its_energy():
+    x, θ, speed, ω = simulated("crane", np.array([0.0, 1.2, 0.3, 0.0]), np.zeros((100, 1))).T
+    kinetic = 0.5 * (TROLLEY + LOAD) * speed**2 + LOAD * ROPE * speed * ω * np.cos(θ)
+    kinetic += 0.5 * LOAD * (ROPE * ω) ** 2
+    energy = kinetic - LOAD * GRAVITY * ROPE * np.cos(θ)
+    assert np.ptp(θ) > 2
+    assert np.ptp(x) > 0.05
+    assert np.ptp(energy) < 1e-4

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import simpson
 
 import envs
 from tests.envs.trajectories import integrated, simulated
@@ -86,3 +87,18 @@ def test_the_plane_maps_points_to_observations_and_back():
     points = torch.rand(5, 7, 2, dtype=torch.float64) * 6 - 3
     assert plane.to_observation(points).shape == (5, 7, 3)
     torch.testing.assert_close(plane.from_observation(plane.to_observation(points)), points)
+
+
+def test_friction_alone_takes_energy():
+    """dE/dt = −b ω²: what is lost over 10 s of free motion, and nothing but that."""
+    env = envs.make("pendulum-swingup", velocity_noise=0.0, dtype=torch.float64)
+    data = env.place(torch.full((1, 1, 1), 0.5).double(), torch.zeros(1, 1, 1).double())
+    energies, losses = [], [0.0]
+    for _ in range(201):
+        θ, ω = env.qpos.item(), env.qvel.item()
+        energies.append(0.5 * ω**2 + GRAVITY * math.cos(θ))
+        losses.append(FRICTION * ω**2)
+        data = env.step(data.set("action", torch.zeros(1, 1, 1)))["next"]
+    lost = simpson(losses[1:], dx=0.05)
+    assert lost > 3
+    assert energies[0] - energies[-1] == pytest.approx(lost, abs=2e-3)

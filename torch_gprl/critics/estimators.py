@@ -30,7 +30,7 @@ from typing import Literal
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from torch_gprl.critics.returns import k_step_returns
 
@@ -121,9 +121,9 @@ def _k_step_baseline(seen: Evaluation) -> Tensor:
 
 def _generalised(seen: Evaluation) -> Tensor:
     columns = (seen.value, seen.next_value, seen.reward, seen.last, seen.terminated)
-    # TorchRL rounds plain numbers to single precision
+    # not TorchRL's vectorised form, which fails for λ = 0; plain numbers would be rounded to single precision
     discount, trace = (seen.value.new_tensor(rate) for rate in (seen.discount, seen.trace))
-    advantage, _ = vec_generalized_advantage_estimate(
+    advantage, _ = generalized_advantage_estimate(
         discount, trace, *(column.unsqueeze(-1) for column in columns)
     )
     return advantage.squeeze(-1)

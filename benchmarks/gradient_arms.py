@@ -1,0 +1,154 @@
+"""Gradient estimators under comparison: critics fitted on an earlier batch, used on a new one."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from benchmarks.gradient_data import STEPS, Batches
+from benchmarks.neural_value import NeuralValue
+from torch_gprl.critics import (
+    ESTIMATORS,
+    USE_ALL_ACTIONS,
+    EstimatorName,
+    Evaluation,
+    GPActionValue,
+    GPValueEstimator,
+)
+from torch_gprl.learners import PolicyGradientConfig
+from torch_gprl.learners.config import Targets
+from torch_gprl.learners.teaching import Teacher, make_critic
+from torch_gprl.objectives import AllActionLoss, PolicyGradientLoss
+
+
+@dataclass(frozen=True)
+class Arm:
+    """An estimator, and the critic behind it: "none", "returns" and "differences" (GP), or "neural"."""
+
+    label: str
+    critic: str
+    estimator: EstimatorName
+    horizon: int = 1
+    trace: float = 0.95
+
+
+ARMS = (
+    Arm("REINFORCE, full return", "none", "return"),
+    Arm("return to go", "none", "reward-to-go"),
+    Arm("return − batch mean", "none", "mean-baseline"),
+    Arm("return − optimal constant", "none", "optimal-baseline"),
+    Arm("(.7) as printed, k = 10", "returns", "k-step", 10),
+    Arm("k = 10 with baseline", "returns", "k-step-baseline", 10),
+    Arm("return − neural V", "neural", "value-baseline"),
+    Arm("return − V_GP", "returns", "value-baseline"),
+    Arm("neural GAE, λ = 0", "neural", "generalised", trace=0.0),
+    Arm("neural GAE, λ = 0.5", "neural", "generalised", trace=0.5),
+    Arm("neural GAE, λ = 0.8", "neural", "generalised", trace=0.8),
+    Arm("neural GAE, λ = 0.95", "neural", "generalised", trace=0.95),
+    Arm("GPTD control variate", "differences", "control-variate"),
+    Arm("GPTD GAE, λ = 0.5", "differences", "generalised", trace=0.5),
+    Arm("GPTD GAE, λ = 0.8", "differences", "generalised", trace=0.8),
+    Arm("GPTD, k = 1, minus V", "differences", "k-step-baseline", 1),
+    Arm("GPTD advantage", "differences", "advantage"),
+    Arm("GPTD all-action", "differences", "all-action"),
+)
+
+
+class Critics(NamedTuple):
+    """One critic of each kind for each learner."""
+
+    gaussian: dict[str, GPActionValue]
+    neural: NeuralValue
+
+
+def fit_critics(earlier: Batches, numbers: PolicyGradientConfig) -> Critics:
+    """All critics, fitted on one earlier batch for each learner."""
+    gaussian = {targets: fit_gaussian(earlier, numbers, targets) for targets in ("returns", "differences")}
+    return Critics(gaussian, NeuralValue(earlier, numbers.discount))
+
+
+def fit_gaussian(earlier: Batches, numbers: PolicyGradientConfig, targets: Targets) -> GPActionValue:
+    """A Gaussian-process critic, taught as the learner teaches it."""
+    config = dataclasses.replace(numbers, targets=targets)
+    critic = make_critic(earlier.policy, config, earlier.data.shape[0])
+    data = GPValueEstimator(critic, earlier.policy, config.discount, horizon=STEPS)(earlier.data.clone())
+    Teacher(critic, earlier.policy, config).teach(data, 0)
+    return critic.requires_grad_(False)
+
+
+def evaluations(new: Batches, critics: Critics, discount: float) -> dict[str, Evaluation]:
+    """What each critic says of new batches."""
+    seen = {
+        name: GPValueEstimator(critic, new.policy, discount).evaluate(new.data)
+        for name, critic in critics.gaussian.items()
+    }
+    nothing = torch.zeros_like(new.true_return)
+    seen["none"] = dataclasses.replace(seen["returns"], taken=nothing, value=nothing, next_value=nothing)
+    value, following = (critics.neural(part["observation"]) for part in (new.data, new.data["next"]))
+    seen["neural"] = dataclasses.replace(seen["none"], value=value, next_value=following)
+    return seen
+
+
+def gradients(arm: Arm, new: Batches, critics: Critics, seen: dict[str, Evaluation]) -> Float[Tensor, "L P"]:
+    """The arm's gradient estimate from each batch: ascent direction, mean over steps."""
+    weight = ESTIMATORS[arm.estimator](
+        dataclasses.replace(seen[arm.critic], horizon=arm.horizon, trace=arm.trace)
+    )
+    critic = critics.gaussian[arm.critic] if arm.estimator in USE_ALL_ACTIONS else None
+    return ascent(new, weight, critic)
+
+
+def ascent(new: Batches, weight: Tensor, critic: GPActionValue | None = None) -> Float[Tensor, "L P"]:
+    """Gradient of each learner's batch for weights of the scores, with the all-action term of `critic`."""
+    policy = new.policy
+    policy.zero_grad()
+    data = new.data.clone(False).set("advantage", weight.unsqueeze(-1))
+    PolicyGradientLoss(policy)(data)["loss_objective"].backward()
+    if critic is not None:
+        AllActionLoss(policy, critic)(data)["loss_all_action"].backward()
+    parts = [p.grad.flatten(1) for p in policy.parameters() if p.grad is not None]
+    return -torch.cat(parts, 1).double()
+
+
+class Quality(NamedTuple):
+    """Figures of one estimator: its value and the ends of a 95 % bootstrap interval, three numbers each."""
+
+    nsr: Tensor
+    cos_mean: Tensor
+    cos_batch: Tensor
+    relative_mse: Tensor
+
+
+RESAMPLES = 2000
+
+
+def quality(estimates: Float[Tensor, "N P"], reference: Float[Tensor, " P"]) -> Quality:
+    """Noise, bias and both of an estimator, against a reference gradient.
+
+    nsr = tr Cov / ‖mean‖²; cosine of the mean with the reference; mean cosine of a single batch; mean squared
+    error over ‖reference‖².
+    """
+    count = len(estimates)
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.multinomial(torch.ones(count), RESAMPLES * count, True, generator=generator)
+    resampled = torch.zeros(RESAMPLES, count, dtype=torch.float64)
+    resampled.scatter_add_(
+        1, drawn.reshape(RESAMPLES, count), torch.ones(RESAMPLES, count, dtype=torch.float64)
+    )
+    share = torch.cat([torch.ones(1, count, dtype=torch.float64), resampled]) / count
+    mean = share @ estimates
+    square, along = estimates.square().sum(1), estimates @ reference
+    length = reference.norm()
+    mean_square = mean.square().sum(1)
+    unbiased = count / (count - 1)
+    figures = (
+        unbiased * (share @ square - mean_square) / mean_square,
+        mean @ reference / mean_square.sqrt() / length,
+        share @ (along / square.sqrt() / length),
+        share @ (estimates - reference).square().sum(1) / length.square(),
+    )
+    tail = torch.tensor([0.025, 0.975], dtype=torch.float64)
+    return Quality(*(torch.cat([figure[:1], figure[1:].quantile(tail)]) for figure in figures))

@@ -38,13 +38,10 @@ class BatchEnv(EnvBase):
         plane: the task's picture plane, or None.
     """
 
-    # TorchRL wraps an environment that has an attribute `frame_skip`; ours repeats physics steps itself.
-    _has_frame_skip = True
-
     def __init__(self, task: Task, options: Options) -> None:
         self._shape = torch.Size([options.learners, options.num_envs])
-        self._to = (torch.device(options.device), options.dtype)
-        super().__init__(device=self._to[0], batch_size=self._shape)
+        super().__init__(device=torch.device(options.device), batch_size=self._shape)
+        self._to = (self.device, options.dtype)
         self.task, self.options = task, options
         self.plane: Plane | None = task.plane
         self._copies = Copies(task, options)
@@ -80,6 +77,12 @@ class BatchEnv(EnvBase):
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
         """Take up what `get_extra_state` gave, for `load_state_dict`."""
         self._copies.load(state)
+
+    def to(self, device: torch.device | str | int) -> "BatchEnv":
+        """Give outputs on another device; the simulation stays where it is."""
+        super().to(device)
+        self._to = (self.device, self.options.dtype)
+        return self
 
     def _make_specs(self) -> None:
         """Read the observation's size and the reward's parts off a trial state."""
@@ -143,7 +146,8 @@ class BatchEnv(EnvBase):
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """A step, then a reset of what is done; as TorchRL's, without the cases that we do not have."""
         keys = tensordict.keys()
-        if "next" in keys or "_step" in keys or tensordict.batch_size != self._shape:
+        foreign = tensordict.batch_size != self._shape or tensordict.device != self._to[0]
+        if foreign or "next" in keys or "_step" in keys:
             return super().step_and_maybe_reset(tensordict)
         outcome, device = self._outcome(tensordict), self._to[0]
         # The next step begins with all that this one had, and all that came after it but the reward.
@@ -172,7 +176,7 @@ class BatchEnv(EnvBase):
                 f"action must be [learners, num_envs, action size] = {list(self._action_shape)}, "
                 f"not {list(action.shape)}"
             )
-        flat = action.cpu().reshape(self._copies.size, -1)
+        flat = action.detach().cpu().reshape(self._copies.size, -1)
         if math.isfinite(flat.sum().item()):  # the quick proof that all entries are
             return flat
         bad = (~action.isfinite()).nonzero().tolist()

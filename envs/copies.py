@@ -20,8 +20,12 @@ from envs.physics import Divergence, State
 from envs.streams import StartDraws, Streams
 from envs.task import Task
 
-NOISE_BLOCKS = {"action": 64, "velocity": 128, "observation": 192}  # addresses within a step
-LONGEST_HORIZON = 2**24 - 1  # steps that the random numbers' addresses have room for
+NOISE_BLOCKS = {
+    "action": 1 << 14,
+    "velocity": 2 << 14,
+    "observation": 3 << 14,
+}  # room for 32,768 numbers each
+LONGEST_HORIZON = 2**32 - 1  # steps that the random numbers' addresses have room for
 COPIES_PER_THREAD = 64  # fewer copies than this are not worth waking another thread for
 
 
@@ -115,7 +119,9 @@ class Copies:
                 self._noise[name] = StepNoise(self._streams, std, widths[name], block)
 
     def reset(self, rows: NDArray[np.intp]) -> None:
-        """Start new episodes in the copies `rows` [R]."""
+        """Start new episodes in the copies `rows` [R], which may be none."""
+        if not rows.size:
+            return
         self._streams.episode[rows] += np.uint64(1)
         self.steps[rows] = 0
         self._physics.place(rows, *self.task.start(StartDraws(self._streams, rows)))
@@ -130,7 +136,8 @@ class Copies:
     def save(self) -> dict[str, Tensor]:
         """All that the future depends on, as copies."""
         steps = torch.from_numpy(self.steps.copy())
-        return {"physics": self._physics.rows.clone(), "steps": steps, **self._streams.save()}
+        derived = {f"derived {name}": value.clone() for name, value in self.state.derived.items()}
+        return {"physics": self._physics.rows.clone(), "steps": steps, **derived, **self._streams.save()}
 
     def load(self, saved: dict[str, Tensor]) -> None:
         """Go on from what `save` gave, bit for bit.
@@ -144,6 +151,8 @@ class Copies:
                 f"{list(self._physics.rows.shape)}; make it with the same task, learners and num_envs"
             )
         self._physics.rows.copy_(saved["physics"])
+        for name, value in self.state.derived.items():
+            value.copy_(saved[f"derived {name}"])
         self.steps[:] = saved["steps"].numpy()
         self._streams.load(saved)
         for noise in self._noise.values():

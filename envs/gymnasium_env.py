@@ -47,7 +47,7 @@ def apply(copies: Copies, actions: NDArray[Any]) -> Step:
     if actions.shape != expected or not np.isfinite(actions).all():
         raise ValueError(f"actions must be finite and of shape {expected}, not {actions.shape}: {actions}")
     shares = torch.from_numpy(np.asarray(actions, dtype=np.float64))
-    return copies.step(copies.low + (shares + 1) / 2 * (copies.high - copies.low))
+    return copies.step((copies.high + copies.low) / 2 + shares * (copies.high - copies.low) / 2)
 
 
 def metadata(task: Task) -> dict[str, Any]:

@@ -59,5 +59,7 @@ class StepNoise:
     def _fill(self, rows: NDArray[np.intp], steps: NDArray[np.int64]) -> None:
         """Compute the vectors of `rows` from the present slot to the last."""
         step = (steps[:, None] + np.arange(AHEAD - self._slot)).astype(np.uint64)
-        unit = self._streams.normal(rows, step, self._ahead.shape[-1], self._block)
-        self._ahead[self._slot :, torch.from_numpy(rows)] = torch.from_numpy(self._std * unit).transpose(0, 1)
+        values = self._streams.normal(rows, step, self._ahead.shape[-1], self._block)
+        self._ahead[self._slot :, torch.from_numpy(rows)] = torch.from_numpy(self._std * values).transpose(
+            0, 1
+        )

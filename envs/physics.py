@@ -127,7 +127,7 @@ class MujocoPhysics(Physics):
         qpos, qvel, control = (self._columns(name) for name in ("qpos", "qvel", "ctrl"))
         self.qpos, self.qvel, self.control = self.rows[:, qpos], self.rows[:, qvel], self.rows[:, control]
         with warnings.catch_warnings():
-            # MuJoCo overwrites these at each call; we write them only to undo a step.
+            # MuJoCo overwrites these at each call; they are written only to go back to an earlier state.
             warnings.filterwarnings("ignore", "The given NumPy array is not writable")
             self.derived = {name: torch.from_numpy(self.batch.bind(name)) for name in derived}
         self._past_derived = {name: value.clone() for name, value in self.derived.items()}

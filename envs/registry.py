@@ -20,8 +20,8 @@ def find(task_id: str) -> Task:
     if task_id in ALL:
         return ALL[task_id]
     near = difflib.get_close_matches(task_id, ALL, n=1, cutoff=0.3)
-    hint = f"; did you mean {near[0]!r}?" if near else ";"
-    raise ValueError(f"unknown task {task_id!r}{hint} Choose one of {', '.join(ALL)}")
+    hint = f"did you mean {near[0]!r}? Or choose" if near else "choose"
+    raise ValueError(f"unknown task {task_id!r}; {hint} one of {', '.join(ALL)}")
 
 
 def make(task_id: str, **options: object) -> BatchEnv:

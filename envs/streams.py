@@ -16,8 +16,8 @@ from envs.philox import philox, unit
 
 MASK64 = 0xFFFFFFFFFFFFFFFF
 LEARNER_STRIDE = 65536  # seeds between learners where Gymnasium's generators are used
-BLOCK_BITS = 8  # a step owns 2⁸ blocks of four words; 24 bits remain for the step
-START_BLOCK = 0  # where the draws of an episode's start begin
+ENV_BITS = 16  # of a word that holds the environment's index below and the block above: 65,536 of each
+START_BLOCK = 0  # where the draws of an episode's start begin, among the blocks of an address
 
 
 class Streams:
@@ -82,7 +82,7 @@ class Streams:
             rows: [R] flat indices of the environments that draw.
             step: [R, *S] the step within the episode at which they draw.
             size: how many numbers each address draws.
-            block: where in the step's 256 blocks of two numbers to begin.
+            block: at which of the address's blocks of two numbers to begin.
 
         Returns:
             [R, *S, size] float64.
@@ -92,10 +92,10 @@ class Streams:
         words = philox(
             self.key,
             [
-                self._env[rows][spread],
+                self._env[rows][spread] | blocks << np.uint64(ENV_BITS),
                 self._learner[rows][spread],
                 self.episode[rows][spread],
-                (step[..., None] << np.uint64(BLOCK_BITS)) | blocks,
+                step[..., None],
             ],
         )
         pairs = np.stack([unit(words[0], words[1]), unit(words[2], words[3])], axis=-1)
@@ -123,9 +123,6 @@ class StartDraws:
         self._step = np.zeros(len(rows), dtype=np.uint64)
         self._block = START_BLOCK
 
-    def __len__(self) -> int:
-        return len(self._rows)
-
     @property
     def generators(self) -> list[np.random.Generator]:
         """Gymnasium's generators of the R environments, for tasks that draw as Gymnasium does."""
@@ -133,12 +130,12 @@ class StartDraws:
 
     def uniform(self, low: float, high: float, size: int) -> Tensor:
         """[R, size] numbers uniform in [low, high), float64."""
-        unit = self._streams.uniform(self._rows, self._step, size, self._block)
+        values = self._streams.uniform(self._rows, self._step, size, self._block)
         self._block += (size + 1) // 2
-        return torch.from_numpy(low + (high - low) * unit)
+        return torch.from_numpy(low + (high - low) * values)
 
     def normal(self, std: float, size: int) -> Tensor:
         """[R, size] normal numbers of standard deviation `std`, float64."""
-        unit = self._streams.normal(self._rows, self._step, size, self._block)
+        values = self._streams.normal(self._rows, self._step, size, self._block)
         self._block += (size + 1) // 2
-        return torch.from_numpy(std * unit)
+        return torch.from_numpy(std * values)

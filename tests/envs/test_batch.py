@@ -1,5 +1,6 @@
 """The batched environment: what TorchRL asks of it, and what does not depend on the batch."""
 
+import io
 import math
 
 import pytest
@@ -87,6 +88,22 @@ def test_only_masked_environments_are_reset():
     assert torch.equal(out["observation"][~mask.squeeze(-1)], seen[~mask.squeeze(-1)])
 
 
+def test_a_reset_of_none_changes_nothing():
+    env = envs.make("Hopper-v5", num_envs=2)
+    data = env.reset()
+    before = env.qpos
+    data["_reset"] = torch.zeros(1, 2, 1, dtype=torch.bool)
+    env.reset(data)
+    assert torch.equal(env.qpos, before)
+
+
+def test_actions_with_gradients_are_taken_by_value():
+    env = envs.make("pendulum-swingup", num_envs=2)
+    data = env.reset()
+    data["action"] = torch.zeros(env.action_spec.shape, requires_grad=True)
+    assert not env.step(data)["next", "reward"].requires_grad
+
+
 def test_a_time_limit_truncates_and_does_not_terminate():
     env = envs.make("pendulum-swingup", num_envs=2, horizon=7)
     out = env.rollout(20, break_when_any_done=False)["next"]
@@ -140,16 +157,18 @@ def test_noise_has_the_stated_deviation():
     assert (final(action_noise=0.1)[1] - quiet[1]).std().item() == pytest.approx(0.005, rel=0.05)
 
 
-@pytest.mark.parametrize("task", ["pendulum-balance", "Hopper-v5"])
+@pytest.mark.parametrize("task", ["pendulum-balance", "Hopper-v5", "Ant-v5"])
 def test_a_saved_environment_goes_on_bit_for_bit(task):
     env = envs.make(task, num_envs=3, seed=2, horizon=12, **NOISE)
     run(env, 40)
-    saved = env.state_dict()
+    file = io.BytesIO()
+    torch.save(env.state_dict(), file)
     other = envs.make(task, num_envs=3, seed=4, horizon=12, **NOISE)
-    other.load_state_dict(saved)
+    other.load_state_dict(torch.load(io.BytesIO(file.getvalue()), weights_only=True))
     for _ in range(50):
         outs = [e.step(e.full_action_spec.zero())["next"] for e in (env, other)]
         assert torch.equal(outs[0]["observation"], outs[1]["observation"])
+        assert torch.equal(outs[0]["reward"], outs[1]["reward"])
         assert torch.equal(outs[0]["truncated"], outs[1]["truncated"])
         for e, out in zip((env, other), outs, strict=True):
             e.maybe_reset(out)

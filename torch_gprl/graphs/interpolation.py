@@ -8,10 +8,11 @@ nodes enter and leave. A node itself gets all weight; one neighbour is the neare
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 COINCIDENT = 1e-9  # an input this close to a node, in units of the inputs, is the node
+CHUNK = 1024  # inputs whose distances to all nodes are held at a time
 
 
 class Neighbours(NamedTuple):
@@ -41,13 +42,19 @@ def neighbours(
         count: neighbours of each input, at most C − 1.
     """
     with torch.no_grad():
-        rough = torch.cdist(x, nodes).masked_fill(~used.unsqueeze(-2), torch.inf)
-        index = rough.topk(min(count + 1, nodes.shape[-2]), dim=-1, largest=False).indices
-        missing = rough.gather(-1, index).isinf()
+        found = [_nearest(part, nodes, used, min(count + 1, nodes.shape[-2])) for part in x.split(CHUNK, -2)]
+        index, missing = (torch.cat(parts, -2) for parts in zip(*found, strict=True))
     # the matrix products of cdist round nearby points apart
     distance = (x.unsqueeze(-2) - gather_rows(nodes, index)).norm(dim=-1).masked_fill(missing, torch.inf)
     near, reach = distance[..., :count], distance[..., count:]
     return Neighbours(index[..., :count], near, _shepard_weights(near, reach))
+
+
+def _nearest(x: Tensor, nodes: Tensor, used: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Indices of the nearest nodes, and which of them are not in use."""
+    rough = torch.cdist(x, nodes).masked_fill(~used.unsqueeze(-2), torch.inf)
+    values, index = rough.topk(count, dim=-1, largest=False)
+    return index, values.isinf()
 
 
 def _shepard_weights(distance: Tensor, reach: Tensor) -> Tensor:
@@ -59,7 +66,7 @@ def _shepard_weights(distance: Tensor, reach: Tensor) -> Tensor:
     return weight / weight.sum(-1, keepdim=True).clamp_min(torch.finfo(weight.dtype).tiny)
 
 
-def gather_rows(values: Float[Tensor, "..."], index: Int[Tensor, "..."]) -> Float[Tensor, "..."]:
+def gather_rows(values: Shaped[Tensor, "..."], index: Int[Tensor, "..."]) -> Shaped[Tensor, "..."]:
     """Rows [*batch, N, K, R] of values [*batch, C, R] at index [*batch, N, K]; batches broadcast."""
     batch = torch.broadcast_shapes(values.shape[:-2], index.shape[:-2])
     width, flat = values.shape[-1], index.expand(*batch, *index.shape[-2:]).flatten(-2)

@@ -4,7 +4,9 @@ from torch_gprl.kernels.base import Kernel, Product, Scaled, Sum
 from torch_gprl.kernels.columns import Columns
 from torch_gprl.kernels.gaussian_inputs import GaussianInputs
 from torch_gprl.kernels.gpytorch import GPyTorchKernel
+from torch_gprl.kernels.graph_geodesic import GeodesicKernel
 from torch_gprl.kernels.graph_nodes import GraphMatern, ShortestPathKernel
+from torch_gprl.kernels.graph_successor import SuccessorKernel
 from torch_gprl.kernels.linear import Linear
 from torch_gprl.kernels.parameters import Positive
 from torch_gprl.kernels.stationary import Matern, Periodic, RationalQuadratic, SquaredExponential
@@ -13,6 +15,7 @@ __all__ = [
     "Columns",
     "GPyTorchKernel",
     "GaussianInputs",
+    "GeodesicKernel",
     "GraphMatern",
     "Kernel",
     "Linear",
@@ -24,5 +27,6 @@ __all__ = [
     "Scaled",
     "ShortestPathKernel",
     "SquaredExponential",
+    "SuccessorKernel",
     "Sum",
 ]

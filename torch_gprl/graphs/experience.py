@@ -1,0 +1,165 @@
+"""What a robot has seen, as a graph: visited states, and the transitions that lead from each to the next.
+
+A stored transition x → x' also tells where inputs near x go: to x' + J (x − x_i), with J the slope of the
+transitions around it (locally weighted linear regression: Atkeson, Moore and Schaal, 1997). So every input
+has a successor, and the graph reaches beyond its own vertices. Inputs are what the caller makes of states, or
+of states and actions: scaled, and angles as (cos, sin).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from torch_gprl.graphs.interpolation import COINCIDENT, Neighbours, gather_rows, neighbours
+
+SLOPE_RIDGE = 1e-3  # of the squared reach of the neighbours: keeps slopes finite along directions never tried
+
+
+class Successor(NamedTuple):
+    """Where each input is expected to go in one step."""
+
+    point: Float[Tensor, "*batch N D"]
+    alive: Float[Tensor, "*batch N"]  # weight of the neighbours that did not end there
+
+
+class Experience(nn.Module):
+    """The newest transitions of each learner, in buffers of fixed size.
+
+    Args:
+        input_dim: columns of an input.
+        capacity: transitions kept; the oldest go first.
+        landmarks: vertices, spread out over all, that stand for the others where there are too many.
+        interpolate: nearest transitions that speak for an input.
+        slope_neighbours: transitions whose differences give the slope at one.
+        batch_shape: independent learners. All add the same number of transitions.
+
+    Raises:
+        ValueError: a number that is out of its range.
+    """
+
+    states: Float[Tensor, "*batch C D"]
+    next_states: Float[Tensor, "*batch C D"]
+    terminated: Bool[Tensor, "*batch C"]
+    slopes: Float[Tensor, "*batch C D D"]
+    after_nodes: Int[Tensor, "*batch C K"]  # where each transition arrives: vertices and their weights
+    after_weights: Float[Tensor, "*batch C K"]
+    ends: Bool[Tensor, "*batch C"]  # no stored transition starts where this one arrives
+    landmarks: Int[Tensor, "*batch L"]
+    size: Int[Tensor, ""]
+
+    def __init__(
+        self,
+        input_dim: int,
+        capacity: int,
+        landmarks: int = 128,
+        interpolate: int = 4,
+        slope_neighbours: int = 10,
+        batch_shape: Sequence[int] = (),
+    ) -> None:
+        super().__init__()
+        if not (1 <= interpolate < capacity and 1 <= slope_neighbours < capacity):
+            raise ValueError(
+                f"interpolate and slope_neighbours must be at least 1 and below the capacity {capacity}, got "
+                f"{interpolate} and {slope_neighbours}"
+            )
+        if not 1 <= landmarks <= capacity:
+            raise ValueError(f"landmarks must be from 1 to the capacity {capacity}, got {landmarks}")
+        self.capacity = capacity
+        self.interpolate = interpolate
+        self.slope_neighbours = slope_neighbours
+        batch = torch.Size(batch_shape)
+        points = torch.zeros(*batch, capacity, input_dim, dtype=torch.float64)
+        self.register_buffer("states", points)
+        self.register_buffer("next_states", points.clone())
+        self.register_buffer("terminated", torch.zeros(*batch, capacity, dtype=torch.bool))
+        self.register_buffer("slopes", points.new_zeros(*batch, capacity, input_dim, input_dim))
+        self.register_buffer("after_nodes", torch.zeros(*batch, capacity, interpolate, dtype=torch.long))
+        self.register_buffer("after_weights", points.new_zeros(*batch, capacity, interpolate))
+        self.register_buffer("ends", torch.zeros(*batch, capacity, dtype=torch.bool))
+        self.register_buffer("landmarks", torch.zeros(*batch, landmarks, dtype=torch.long))
+        self.register_buffer("size", torch.zeros((), dtype=torch.long))
+
+    @property
+    def mask(self) -> Bool[Tensor, " C"]:
+        """Which rows hold a transition."""
+        return torch.arange(self.capacity, device=self.size.device) < self.size
+
+    @torch.no_grad()
+    def add(
+        self,
+        states: Float[Tensor, "*batch N D"],
+        next_states: Float[Tensor, "*batch N D"],
+        terminated: Bool[Tensor, "*batch N"] | None = None,
+    ) -> None:
+        """Store transitions, then renew slopes, links and landmarks; the oldest make room.
+
+        Costs O(capacity²) distances: add whole batches of trajectories.
+
+        Args:
+            states: x [*batch, N, D].
+            next_states: x' [*batch, N, D]. Equal to the next row of `states` inside a trajectory; where it
+                equals none, as at a time limit, the graph goes on at the vertices nearest to it.
+            terminated: where the episode ended, and the value beyond is 0 [*batch, N]; nowhere unless told.
+        """
+        if terminated is None:
+            terminated = torch.zeros(states.shape[:-1], dtype=torch.bool, device=self.size.device)
+        held, new = int(self.size), states.shape[-2]
+        kept = slice(max(0, held + new - self.capacity), held)
+        for buffer, values in (
+            (self.states, states),
+            (self.next_states, next_states),
+            (self.terminated.unsqueeze(-1), terminated.unsqueeze(-1)),
+        ):
+            together = torch.cat([buffer[..., kept, :], values.to(buffer)], -2)[..., -self.capacity :, :]
+            buffer[..., : together.shape[-2], :] = together
+        self.size.fill_(min(held + new, self.capacity))
+        used = slice(int(self.size))
+        self.slopes[..., used, :, :] = self._local_slopes(
+            self.states[..., used, :], self.next_states[..., used, :]
+        )
+        after = self.nearest(self.next_states[..., used, :])
+        self.after_nodes[..., used, :] = after.nodes
+        self.after_weights[..., used, :] = after.weight
+        self.ends[..., used] = (after.distance[..., 0] > COINCIDENT) & ~self.terminated[..., used]
+        self.landmarks.copy_(_farthest_points(self.states[..., used, :], self.landmarks.shape[-1]))
+
+    def nearest(self, x: Float[Tensor, "*#batch N D"]) -> Neighbours:
+        """The visited states that speak for x [*batch, N, D]."""
+        return neighbours(x, self.states, self.mask, self.interpolate)
+
+    def successor(self, x: Float[Tensor, "*#batch N D"]) -> Successor:
+        """Where x [*batch, N, D] is expected to go: x' of its neighbours, corrected by their slopes."""
+        found = self.nearest(x)
+        offset = x.unsqueeze(-2) - gather_rows(self.states, found.nodes)
+        slopes = gather_rows(self.slopes.flatten(-2), found.nodes).unflatten(-1, self.slopes.shape[-2:])
+        arrivals = gather_rows(self.next_states, found.nodes) + (slopes @ offset.unsqueeze(-1)).squeeze(-1)
+        ended = gather_rows(self.terminated.unsqueeze(-1), found.nodes).squeeze(-1)
+        return Successor((found.weight.unsqueeze(-1) * arrivals).sum(-2), (found.weight * ~ended).sum(-1))
+
+    def _local_slopes(self, states: Tensor, next_states: Tensor) -> Tensor:
+        """J at every state: regression of the differences of x' on those of x, the nearest weighing most."""
+        count = min(self.slope_neighbours + 1, states.shape[-2])
+        distance, index = torch.cdist(states, states).topk(count, dim=-1, largest=False)
+        reach = distance[..., -1:].clamp_min(COINCIDENT)
+        weight = (1 - (distance / (reach * 1.001)).pow(3)).pow(3).unsqueeze(-1)  # tricube
+        # the slope of the displacement x' − x: the ridge then draws towards "as the neighbour moved"
+        X = gather_rows(states, index) - states.unsqueeze(-2)
+        Y = gather_rows(next_states, index) - next_states.unsqueeze(-2) - X
+        eye = torch.eye(states.shape[-1], dtype=states.dtype, device=states.device)
+        ridge = SLOPE_RIDGE * (weight.sum(-2) * reach.square()).unsqueeze(-1) * eye
+        slope = torch.linalg.solve((weight * X).mT @ X + ridge, (weight * X).mT @ Y)
+        return slope.mT + eye
+
+
+def _farthest_points(points: Tensor, count: int) -> Tensor:
+    """Indices of points each of which is the farthest from those before it; the last again if too few."""
+    chosen = [torch.zeros(points.shape[:-2], dtype=torch.long, device=points.device)]
+    distance = torch.full(points.shape[:-1], torch.inf, dtype=points.dtype, device=points.device)
+    for _ in range(count - 1):
+        last = chosen[-1][..., None, None].expand(*points.shape[:-2], 1, points.shape[-1])
+        distance = torch.minimum(distance, (points - points.gather(-2, last)).norm(dim=-1))
+        chosen.append(distance.argmax(-1))
+    return torch.stack(chosen, -1)

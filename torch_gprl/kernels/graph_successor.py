@@ -1,0 +1,167 @@
+"""The prior that rewards and transitions give to values: V = (I − γP)⁻¹ r, hence K = M K_r Mᵀ.
+
+With M = (I − γP)⁻¹ over visited states and a squared exponential K_r on rewards, two states covary as much as
+what follows them does: values may jump between neighbours that part, and agree where trajectories merge.
+Directed, and positive semi-definite by construction. The features M φ are Dayan's (1993) successor
+representation; as a prior of values it is that of Engel et al. (2005) with the transitions known.
+
+Inputs off the graph are followed ahead: x, its expected successor, and so on, for some steps before the last
+one borrows from the vertices near it. That is what finds the side of a ridge on which an input lies.
+
+| paper | here | meaning |
+|---|---|---|
+| φ | `_reward_features` | K_r(x, Z) L⁻ᵀ, on landmarks Z with K_r(Z, Z) = LLᵀ |
+| Mφ | `vertices` | expected discounted sum of φ from each visited state on |
+"""
+
+import numpy as np
+import torch
+from scipy.sparse import csc_array, eye_array
+from scipy.sparse.linalg import SuperLU, splu
+from torch import Tensor
+from torch.autograd.function import FunctionCtx
+
+from torch_gprl.graphs.experience import Experience
+from torch_gprl.kernels.distance import log_gaussian
+from torch_gprl.kernels.graph import Factors, Table, TableKernel
+from torch_gprl.kernels.graph_geodesic import check_discount
+from torch_gprl.kernels.parameters import Positive, PositiveValue, log_parameter
+from torch_gprl.linalg import cholesky
+from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
+
+
+class SuccessorKernel(TableKernel):
+    """σ² (Mφ)(x) (Mφ)(z)ᵀ, scaled to a prior variance that is σ² on average over visited states.
+
+    It knows nothing where there is no experience, and the transitions of others are a guess: add an ordinary
+    kernel, `SuccessorKernel(…) + Matern(…)`, for what it cannot tell.
+
+    Args:
+        experience: visited states and transitions; may grow at any time.
+        discount: γ of the values that are learned, between 0 and 1.
+        lengthscale: of rewards, in units of the inputs; broadcasts to [*batch, D].
+        outputscale: σ², prior variance of values; broadcasts to [*batch].
+        lookahead: steps that an input off the graph is followed before it borrows from vertices.
+
+    Raises:
+        ValueError: a discount outside (0, 1), or a negative lookahead.
+    """
+
+    lengthscale = Positive()
+    outputscale = Positive()
+
+    def __init__(
+        self,
+        experience: Experience,
+        discount: float,
+        lengthscale: PositiveValue = 1.0,
+        outputscale: PositiveValue = 1.0,
+        lookahead: int = 20,
+    ) -> None:
+        batch, dims = experience.states.shape[:-2], experience.states.shape[-1]
+        super().__init__(dims, batch)
+        check_discount(discount)
+        if lookahead < 0:
+            raise ValueError(f"lookahead must be at least 0 steps, got {lookahead}")
+        self.log_lengthscale = log_parameter(lengthscale, "lengthscale", (*batch, dims))
+        self.log_outputscale = log_parameter(outputscale, "outputscale", batch)
+        self.experience = experience
+        self.discount = discount
+        self.lookahead = lookahead
+
+    def forward(self, x: Inputs, z: OtherInputs) -> CrossMatrix:
+        """Covariance of x [*batch, N, D] with z [*batch, M, D]: [*batch, N, M]."""
+        left, _ = self.features(x)
+        right = left if z is x else self.features(z)[1]
+        return self.outputscale[..., None, None] * (left @ right.mT)
+
+    def diag(self, x: Inputs) -> PerPoint:
+        """Prior variance at x [*batch, N, D]: [*batch, N]."""
+        left, right = self.features(x)
+        return self.outputscale.unsqueeze(-1) * torch.linalg.vecdot(left, right)
+
+    def _build_table(self) -> Table:
+        """Landmarks, the inverse of their factor, and Mφ of every vertex [*batch, C, L], all scaled."""
+        visited = self.experience
+        index = visited.landmarks.unsqueeze(-1).expand(*visited.landmarks.shape, self.input_dim)
+        landmarks = visited.states.gather(-2, index)
+        factor = cholesky(log_gaussian(landmarks, landmarks, self.log_lengthscale).exp())
+        eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
+        inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
+        used = visited.mask.unsqueeze(-1)
+        values = self._vertices(landmarks, inverse) * used
+        variance = values.square().sum(-1).sum(-1) / visited.size.clamp_min(1)
+        scale = torch.where(variance > 0, variance, torch.inf).rsqrt()[..., None, None]
+        return landmarks, inverse * scale, values * scale
+
+    def _vertices(self, landmarks: Tensor, inverse: Tensor) -> Tensor:
+        """Mφ of every vertex: Mφ(x) = φ(x) + γ Mφ(x'), the ends of trajectories followed ahead."""
+        visited = self.experience
+        rewards = self._reward_features(visited.states, landmarks, inverse)
+        nodes, weights = visited.after_nodes.clone(), visited.after_weights.clone()
+        going = self.discount * (~visited.terminated).to(inverse.dtype)
+        rows = visited.ends.reshape(-1, visited.capacity).any(0).nonzero().flatten()  # an end of any learner
+        ends = visited.ends[..., rows]
+        ahead, left, reached = self._follow(visited.next_states[..., rows, :], landmarks, inverse)
+        rewards = rewards.index_add(-2, rows, (going[..., rows] * ends).unsqueeze(-1) * ahead)
+        going[..., rows] *= torch.where(ends, left, 1.0)
+        found = visited.nearest(reached)
+        nodes[..., rows, :] = torch.where(ends.unsqueeze(-1), found.nodes, nodes[..., rows, :])
+        weights[..., rows, :] = torch.where(ends.unsqueeze(-1), found.weight, weights[..., rows, :])
+        return _resolve(nodes, weights * going.unsqueeze(-1), rewards)
+
+    def _build_features(self, x: Tensor, table: Table) -> Factors:
+        landmarks, inverse, vertices = table
+        ahead, left, reached = self._follow(x, landmarks, inverse)
+        features = ahead + left.unsqueeze(-1) * self.experience.nearest(reached).average(vertices)
+        return features, features
+
+    def _follow(self, x: Tensor, landmarks: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Discounted φ along the expected way from x, the weight of what follows, and where that is."""
+        batch = torch.broadcast_shapes(x.shape[:-2], self.batch_shape)
+        total = x.new_zeros(*batch, x.shape[-2], inverse.shape[-1])
+        weight = x.new_ones(*batch, x.shape[-2])
+        for _ in range(self.lookahead):
+            total = total + weight.unsqueeze(-1) * self._reward_features(x, landmarks, inverse)
+            x, alive = self.experience.successor(x)
+            weight = weight * self.discount * alive
+        return total, weight, x
+
+    def _reward_features(self, x: Tensor, landmarks: Tensor, inverse: Tensor) -> Tensor:
+        return log_gaussian(x, landmarks, self.log_lengthscale).exp() @ inverse.mT
+
+
+def _resolve(nodes: Tensor, weights: Tensor, right: Tensor) -> Tensor:
+    """(I − T)⁻¹ right [*batch, C, L], with weights T_ij [*batch, C, K] at j = nodes[i]; for each learner."""
+    size = right.shape[-2]
+    flat = (tensor.reshape(-1, size, tensor.shape[-1]) for tensor in (nodes, weights, right))
+    solved = [_solve_sparse(_factorise(n, w), r) for n, w, r in zip(*flat, strict=True)]
+    return torch.stack(solved).reshape(right.shape)
+
+
+def _factorise(nodes: Tensor, weights: Tensor) -> SuperLU:
+    size, count = nodes.shape
+    rows = np.repeat(np.arange(size), count)
+    entries = weights.detach().cpu().double().numpy().ravel(), (rows, nodes.cpu().numpy().ravel())
+    return splu(csc_array(eye_array(size) - csc_array(entries, shape=(size, size))))
+
+
+def _solve_sparse(factor: SuperLU, right: Tensor) -> Tensor:
+    solved = _SparseSolve.apply(right, factor)
+    assert isinstance(solved, Tensor)
+    return solved
+
+
+class _SparseSolve(torch.autograd.Function):
+    """A⁻¹ right for a sparse A that SciPy has factorised, differentiable in the right-hand side."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, right: Tensor, factor: SuperLU) -> Tensor:
+        ctx.factor = factor  # pyright: ignore[reportAttributeAccessIssue]
+        return torch.from_numpy(factor.solve(right.detach().cpu().double().numpy())).to(right)
+
+    @staticmethod
+    def backward(ctx: FunctionCtx, *gradients: Tensor) -> tuple[Tensor, None]:
+        factor: SuperLU = ctx.factor  # pyright: ignore[reportAttributeAccessIssue]
+        gradient = gradients[0].detach().cpu().double().numpy()
+        return torch.from_numpy(factor.solve(gradient, trans="T")).to(gradients[0]), None

@@ -76,12 +76,9 @@ def test_missing_libraries_lead_to_a_sketch(monkeypatch):
         assert picture(0.0).float().std() > 1
 
 
-@pytest.mark.parametrize("platform", ["egl", "osmesa", "disable", ""])
-def test_no_choice_of_opengl_breaks_the_import(platform):
+def test_a_choice_of_opengl_that_is_not_there_does_not_break_the_import():
     """MuJoCo's own import fails where MUJOCO_GL names a library that is missing."""
-    program = (
-        "import envs; env = envs.make('crane'); env.reset(); print(env.render(width=32, height=32).shape)"
-    )
-    environment = os.environ | {"MUJOCO_GL": platform, "PYTHONPATH": str(Path(envs.__file__).parents[1])}
+    program = "import envs; e = envs.make('crane'); e.reset(); print(e.render(width=32, height=32).shape)"
+    environment = os.environ | {"MUJOCO_GL": "osmesa", "PYTHONPATH": str(Path(envs.__file__).parents[1])}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
     assert done.stdout.strip() == "torch.Size([32, 32, 3])", done.stderr

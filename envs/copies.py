@@ -207,4 +207,5 @@ class Copies:
 def _threads(threads: int | None, copies: int) -> int:
     if threads is not None:
         return threads
-    return max(1, min(len(os.sched_getaffinity(0)), copies // COPIES_PER_THREAD))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(cores, copies // COPIES_PER_THREAD))

@@ -6,8 +6,10 @@ computes shall not care, so the variable is hidden during the import; this modul
 
 import ctypes
 import os
+import sys
 
 LIBRARIES = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}  # platform -> what it loads
+WINDOWED = ("glfw", "cgl")  # platforms of machines with a screen, whose libraries MuJoCo finds itself
 
 
 def loads(platform: str) -> bool:
@@ -26,8 +28,8 @@ def choose_platform() -> str:
         OSError: if it cannot be loaded, or none can, or drawing is disabled.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower()
-    if wanted == "glfw":
-        return wanted
+    if wanted in WINDOWED or (not wanted and sys.platform != "linux"):
+        return wanted or "glfw"
     if wanted and wanted not in LIBRARIES:
         raise OSError(f"MUJOCO_GL={wanted}")
     for platform in [wanted] if wanted else LIBRARIES:

@@ -85,6 +85,7 @@ class WhitenedState(nn.Module):
             raise ValueError(f"noise_variance must be positive and finite, got {noise_variance}")
         self.log_noise_variance = nn.Parameter(noise.log().clone())
         self._register_state(like)
+        self.register_state_dict_pre_hook(_before_save)
         self.register_load_state_dict_post_hook(_after_load)
         self._accept_state()
 
@@ -313,6 +314,12 @@ def _check_dtype(dtype: torch.dtype) -> None:
             "the prior variance is lost in rounding; float64 costs little, and only memory speaks against it",
             stacklevel=3,
         )
+
+
+def _before_save(module: nn.Module, prefix: str, keep_vars: bool) -> None:
+    """What is saved belongs to the kernel that is saved with it."""
+    assert isinstance(module, WhitenedState)
+    module.refresh()
 
 
 def _after_load(module: nn.Module, keys: object) -> None:

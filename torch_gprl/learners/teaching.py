@@ -9,7 +9,7 @@ import math
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
@@ -120,6 +120,7 @@ class Teacher:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what `state_dict` gave."""
         self.critic.load_state_dict(state["critic"])
-        if self.replay is not None and state["replay"] is not None:
+        stored = state["replay"]
+        if self.replay is not None and stored is not None:
             self.replay.empty()
-            self.replay.extend(state["replay"])
+            self.replay.extend(TensorDict(stored, stored["action"].shape[:2]))  # [steps, learners]

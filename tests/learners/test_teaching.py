@@ -1,0 +1,132 @@
+"""How the critic lives through policy updates: targets, replay, ageing; that every option runs."""
+
+import io
+import itertools
+from typing import Any, get_args
+
+import pytest
+import torch
+
+import envs
+from torch_gprl.critics import EstimatorName
+from torch_gprl.gp import AgeAwareScore
+from torch_gprl.learners import PolicyGradient, PolicyGradientConfig
+
+ENVS, STEPS = 4, 25
+
+
+def learner(
+    updates: int = 3, learners: int = 2, task: str = "pendulum-balance", **numbers: Any
+) -> PolicyGradient:
+    env = envs.make(task, learners=learners, num_envs=ENVS, seed=3, dtype=torch.float64, threads=1)
+    defaults = {"rollout_steps": STEPS, "budget": 30, "horizon": 20}
+    return PolicyGradient(
+        env, PolicyGradientConfig(total_frames=updates * ENVS * STEPS, **(defaults | numbers))
+    )
+
+
+@pytest.mark.parametrize("targets", ["returns", "differences"])
+@pytest.mark.parametrize("name", get_args(EstimatorName))
+def test_every_estimator_moves_every_parameter(name, targets):
+    made = learner(2, estimator=name, targets=targets)
+    before = {key: parameter.clone() for key, parameter in made.policy.named_parameters()}
+    for figures in made.train():
+        assert (figures["gradient_norm"] > 0).all()
+        assert (figures["gradient_cosine"].abs() <= 1).all()
+        assert (figures["value_error"] > 0).all()
+    assert all(not torch.equal(before[key], new) for key, new in made.policy.named_parameters())
+
+
+@pytest.mark.parametrize("optimiser", ["natural", "adam", "plain"])
+def test_every_optimiser_moves_the_policy(optimiser):
+    made = learner(2, optimiser=optimiser)
+    before = [parameter.clone() for parameter in made.policy.parameters()]
+    list(made.train())
+    assert all(not torch.equal(old, new) for old, new in zip(before, made.policy.parameters(), strict=True))
+
+
+def test_exploration_is_learned_or_fixed_or_on_schedule():
+    spreads = {}
+    for exploration in ("learned", "fixed", "scheduled"):
+        made = learner(updates=4, exploration=exploration, final_std=0.1)
+        half = made.policy.head.half_range
+        spreads[exploration] = torch.stack([figures["sigma"] / half for figures in made.train()])[:, 0]
+    torch.testing.assert_close(spreads["fixed"], torch.full((4,), 0.5).double())
+    torch.testing.assert_close(spreads["scheduled"], torch.tensor([0.4, 0.3, 0.2, 0.1]).double())
+    assert not torch.isclose(spreads["learned"][-1], spreads["fixed"][-1])
+
+
+def test_the_gradient_is_that_of_the_whole_rollout():
+    made = learner(updates=1)
+    grads = {}
+    made.optimiser.zero_grad = lambda: [setattr(p, "grad", None) for p in made.policy.parameters()]
+    original = made._differentiate
+
+    def both(rollout, parameters):
+        figures = original(rollout, parameters)
+        grads["halves"] = [p.grad.clone() for p in parameters]
+        made.policy.zero_grad()
+        made.losses[0](rollout)["loss_objective"].backward()
+        grads["whole"] = [p.grad.clone() for p in parameters]
+        return figures
+
+    made._differentiate = both
+    list(made.train())
+    for halves, whole in zip(grads["halves"], grads["whole"], strict=True):
+        torch.testing.assert_close(halves, whole, rtol=1e-9, atol=1e-12)
+
+
+def test_a_replay_keeps_the_newest_transitions_and_the_critic_knows_no_others():
+    made = learner(updates=4, targets="differences", replay=150)
+    for figures in made.train():
+        steps = min(made.updates * ENVS * STEPS, 150)
+        assert (made.critic.gp.observations == steps).all()
+        assert figures["outdated"].shape == (2,)
+
+
+def test_a_critic_renewed_at_every_update_has_nothing_out_of_date():
+    renewed = [figures["outdated"] for figures in learner(3, renew_every=1).train()]
+    kept = [figures["outdated"] for figures in learner(6, renew_every=1000, novelty_threshold=1e-4).train()]
+    assert all((share == 0).all() for share in renewed)
+    assert (kept[-1] > 0.3).all()
+
+
+def test_age_makes_the_critic_forget_its_oldest_basis_vectors():
+    shares = {}
+    for weight in (0.0, 1.0):
+        made = learner(7, age_weight=weight, renew_every=1000, novelty_threshold=1e-4)
+        assert isinstance(made.critic.gp.pruning, AgeAwareScore) == bool(weight)
+        shares[weight] = [figures["outdated"] for figures in made.train()][-1]
+    assert (shares[1.0] <= shares[0.0]).all()
+    assert (shares[1.0] < shares[0.0]).any()
+
+
+@pytest.mark.parametrize("replay", [0, 150])
+def test_a_saved_run_goes_on_as_it_would_have(replay):
+    numbers = {"updates": 4, "targets": "differences", "estimator": "all-action", "replay": replay}
+    made, other = learner(**numbers), learner(**numbers)
+    training = made.train()
+    list(itertools.islice(training, 2))
+    training.close()
+    file = io.BytesIO()
+    torch.save({"learner": made.state_dict(), "env": made.env.state_dict()}, file)
+    file.seek(0)
+    saved = torch.load(file, weights_only=True)
+    other.load_state_dict(saved["learner"])
+    other.env.load_state_dict(saved["env"])
+    for one, two in zip(made.train(), other.train(), strict=True):
+        assert all(torch.equal(one[key].nan_to_num(), two[key].nan_to_num()) for key in one)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"replay": 100}, "needs targets 'differences'"),
+        ({"replay": -1}, "replay must be at least 0"),
+        ({"age_weight": 1.5}, "age_weight must lie between 0 and 1, got 1.5"),
+        ({"noise": 0.0}, "noise must be positive"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(numbers, message):
+    with pytest.raises(ValueError, match=message):
+        PolicyGradientConfig(**numbers)

@@ -319,7 +319,8 @@ def _check_dtype(dtype: torch.dtype) -> None:
 def _before_save(module: nn.Module, prefix: str, keep_vars: bool) -> None:
     """What is saved belongs to the kernel that is saved with it."""
     assert isinstance(module, WhitenedState)
-    module.refresh()
+    if module._kernel_versions() != module._kernel_seen:
+        module.rebase()
 
 
 def _after_load(module: nn.Module, keys: object) -> None:

@@ -9,7 +9,7 @@ import math
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
@@ -114,13 +114,11 @@ class Teacher:
         """Critic and replay."""
         return {
             "critic": self.critic.state_dict(),
-            "replay": None if self.replay is None or not len(self.replay) else self.replay[:].to_dict(),
+            "replay": self.replay.state_dict() if self.replay is not None and len(self.replay) else None,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what `state_dict` gave."""
         self.critic.load_state_dict(state["critic"])
-        stored = state["replay"]
-        if self.replay is not None and stored is not None:
-            self.replay.empty()
-            self.replay.extend(TensorDict(stored, stored["action"].shape[:2]))  # [steps, learners]
+        if self.replay is not None and state["replay"] is not None:
+            self.replay.load_state_dict(state["replay"])

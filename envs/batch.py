@@ -158,7 +158,8 @@ class BatchEnv(EnvBase):
         del entries["reward"]
         entries.pop("_reset", None)
         tensordict.set("next", TensorDict._new_unsafe(outcome, self._shape, device=device))
-        return tensordict, self.maybe_reset(TensorDict._new_unsafe(entries, self._shape, device=device))
+        following = TensorDict._new_unsafe(entries, self._shape, device=device)
+        return tensordict, self.maybe_reset(following) if outcome["done"].any() else following
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         """Nothing: TorchRL completes and reshapes entries here, and `_step` leaves none to mend."""
@@ -176,7 +177,9 @@ class BatchEnv(EnvBase):
                 f"action must be [learners, num_envs, action size] = {list(self._action_shape)}, "
                 f"not {list(action.shape)}"
             )
-        flat = action.detach().cpu().reshape(self._copies.size, -1)
+        if action.requires_grad:
+            action = action.detach()
+        flat = action.cpu().flatten(0, 1)
         if math.isfinite(flat.sum().item()):  # the quick proof that all entries are
             return flat
         bad = (~action.isfinite()).nonzero().tolist()

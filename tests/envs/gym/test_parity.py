@@ -13,6 +13,12 @@ SEED = 11
 COPIES = 2
 
 
+@pytest.fixture(autouse=True)
+def _log_elsewhere(tmp_path, monkeypatch):
+    """MuJoCo leaves a log of its warnings about Gymnasium's models where it runs."""
+    monkeypatch.chdir(tmp_path)
+
+
 def reference(task: str, seed: int, actions: np.ndarray, horizon: int) -> dict[str, np.ndarray]:
     """What Gymnasium gives for actions [T, da], with a reset after every end."""
     env = gymnasium.make(task, max_episode_steps=horizon)

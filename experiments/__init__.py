@@ -1,0 +1,1 @@
+"""One command for each claim and figure of the thesis."""

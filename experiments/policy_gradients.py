@@ -1,0 +1,129 @@
+"""Claims 1 and 2 as learning curves: one command runs every arm, same tasks, same seeds, and draws them.
+
+    python -m experiments.policy_gradients --claim 1 [--task pendulum-swingup] [--learners 20]
+    python -m experiments.policy_gradients --claim 2
+
+Claim 1: Gaussian-process action values lower the variance of the gradient, hence speed up learning. The arms
+are ways to weigh the scores. Claim 2: one process kept across policy updates, pruned by information and age,
+beats one that is estimated anew at every update. The arms are weights of the age. Leaves the metrics of every
+arm, summary.json with the means over learners, and a picture.
+"""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+import envs
+from torch_gprl.learners import PolicyGradient, PolicyGradientConfig
+from torch_gprl.runs import MetricsWriter, bootstrap_interval, read_metrics, save_figure
+
+CLAIM_1: dict[str, dict[str, Any]] = {
+    "REINFORCE": {"estimator": "return", "targets": "returns"},
+    "return − batch mean": {"estimator": "mean-baseline", "targets": "returns"},
+    "(.7) as printed, k = 10": {"estimator": "k-step", "horizon": 10, "targets": "returns"},
+    "return − V_GP": {"estimator": "value-baseline", "targets": "returns"},
+    "k = 10 with baseline": {"estimator": "k-step-baseline", "horizon": 10, "targets": "returns"},
+    "GPTD, generalised": {"estimator": "generalised", "trace": 0.8, "targets": "differences"},
+    "GPTD, all-action": {"estimator": "all-action", "targets": "differences"},
+}
+PERSISTENT = {"renew_every": 10**6, "targets": "differences", "budget": 100}
+CLAIM_2: dict[str, dict[str, Any]] = {
+    "estimated anew": PERSISTENT | {"renew_every": 1},
+    **{f"kept, λ = {weight}": PERSISTENT | {"age_weight": weight} for weight in (0.0, 0.25, 0.5, 0.75, 1.0)},
+}
+PANELS = {
+    "return": "return per episode",
+    "gradient_cosine": "cosine of gradients from two halves",
+    "value_error": "RMSE of Q against roll-outs",
+    "outdated": "share of basis vectors out of date",
+}
+SMOOTHED = 5  # updates
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to run."""
+
+    claim: Literal[1, 2]  # of the thesis
+    task: str = "pendulum-swingup"  # id of the task
+    learners: int = 20  # independent learners of every arm
+    num_envs: int = 5  # environments of each learner
+    frames: int = 60_000  # environment steps per learner
+    seed: int = 0  # of all arms
+    out: Path = Path("runs/policy-gradients")  # where results go
+
+
+def main(options: Options) -> None:
+    """Run every arm of a claim, leave metrics, summary and picture."""
+    torch.set_num_threads(1)
+    folder = options.out / f"claim-{options.claim}-{options.task}"
+    curves = {}
+    for name, numbers in (CLAIM_1 if options.claim == 1 else CLAIM_2).items():
+        curves[name] = run(options, numbers, folder / name.replace(" ", "-"))
+        value, low, high = summary(curves[name]["return"])
+        print(f"{name:26s} return of the last tenth {value:8.1f} [{low:.1f}, {high:.1f}]", flush=True)
+    figures = {
+        name: {key: dict(zip(("mean", "low", "high"), summary(arm[key]), strict=True)) for key in PANELS}
+        for name, arm in curves.items()
+    }
+    (folder / "summary.json").write_text(json.dumps(figures, indent=2, ensure_ascii=False) + "\n")
+    save_figure(draw(curves, options.task), folder / "curves.png")
+    print(f"everything is in {folder}")
+
+
+def run(options: Options, numbers: dict[str, Any], folder: Path) -> dict[str, Float[np.ndarray, "updates L"]]:
+    """One arm: its metrics by name."""
+    env = envs.make(
+        options.task, learners=options.learners, num_envs=options.num_envs, seed=options.seed, threads=1
+    )
+    config = dataclasses.replace(PolicyGradientConfig(total_frames=options.frames), **numbers)
+    learner = PolicyGradient(env, config, seed=options.seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    writer = MetricsWriter(folder / "metrics.csv", folder / "tensorboard")
+    for figures in learner.train():
+        writer.write(learner.updates, learner.frames, figures)
+    writer.close()
+    return read_metrics(folder / "metrics.csv")
+
+
+def summary(metric: Float[np.ndarray, "updates L"]) -> tuple[float, float, float]:
+    """Mean over learners of the last tenth of a run, with its 95 % interval."""
+    last = metric[-max(1, len(metric) // 10) :].mean(axis=0)
+    low, high = bootstrap_interval(last)
+    return float(last.mean()), float(low), float(high)
+
+
+def draw(curves: dict[str, dict[str, Float[np.ndarray, "updates L"]]], title: str) -> Figure:
+    """One panel for each metric, one line with its interval for each arm."""
+    figure = Figure(figsize=(11, 7.5), layout="constrained")
+    figure.suptitle(title)
+    for axes, (key, label) in zip(figure.subplots(2, 2).flat, PANELS.items(), strict=True):
+        for name, arm in curves.items():
+            smooth = _moving_mean(arm[key])
+            frames = arm["frames"][len(arm["frames"]) - len(smooth) :, 0]
+            low, high = bootstrap_interval(smooth)
+            (line,) = axes.plot(frames, smooth.mean(axis=1), label=name, linewidth=1.5)
+            axes.fill_between(frames, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+        axes.set(xlabel="environment steps per learner", ylabel=label)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.25, linewidth=0.5)
+    figure.axes[0].legend(frameon=False, fontsize="small")
+    return figure
+
+
+def _moving_mean(metric: Float[np.ndarray, "updates L"]) -> Float[np.ndarray, "smoothed L"]:
+    """Mean of neighbouring updates; NaN where one has none."""
+    windows = np.lib.stride_tricks.sliding_window_view(metric, min(SMOOTHED, len(metric)), axis=0)
+    return windows.mean(axis=-1)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))

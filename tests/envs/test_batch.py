@@ -197,7 +197,8 @@ def test_an_action_of_the_wrong_shape_is_named():
         env.step(data)
 
 
-def test_a_diverged_simulation_ends_and_leaves_no_bad_number():
+def test_a_diverged_simulation_ends_and_leaves_no_bad_number(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log where it runs
     env = envs.make("Ant-v5", num_envs=3, info=True)
     env.reset()
     qvel = torch.zeros_like(env.qvel)

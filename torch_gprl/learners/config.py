@@ -52,7 +52,7 @@ class PolicyGradientConfig:
     exploration: Exploration = "learned"  # of the standard deviation; scheduled goes in equal steps
     final_std: float = 0.1  # where the scheduled standard deviation ends, in halves of the actuator's range
     optimiser: Optimiser = "natural"  # natural gradient in a trust region, Adam, or the plain gradient
-    trust_region: float = 0.02  # KL divergence of the first natural step, nats; falls linearly to 0
+    trust_region: float = 0.05  # KL divergence of the first natural step, nats; falls linearly to 0
     learning_rate: float = 0.01  # of Adam and of the plain gradient; falls linearly to 0
 
     targets: Targets = "returns"  # the critic learns values from returns, or rewards as temporal differences

@@ -141,13 +141,13 @@ class Experience(nn.Module):
 
     def _local_slopes(self, states: Tensor, next_states: Tensor) -> Tensor:
         """J at every state: regression of the differences of x' on those of x, the nearest weighing most."""
-        count = min(self.slope_neighbours + 1, states.shape[-2])
-        distance, index = torch.cdist(states, states).topk(count, dim=-1, largest=False)
-        reach = distance[..., -1:].clamp_min(COINCIDENT)
-        weight = (1 - (distance / (reach * 1.001)).pow(3)).pow(3).unsqueeze(-1)  # tricube
+        everywhere = torch.ones(states.shape[:-1], dtype=torch.bool, device=states.device)
+        near = neighbours(states, states, everywhere, min(self.slope_neighbours + 1, states.shape[-2]))
+        reach = near.distance[..., -1:].clamp_min(COINCIDENT)
+        weight = (1 - (near.distance / (reach * 1.001)).pow(3)).pow(3).unsqueeze(-1)  # tricube
         # the slope of the displacement x' − x: the ridge then draws towards "as the neighbour moved"
-        X = gather_rows(states, index) - states.unsqueeze(-2)
-        Y = gather_rows(next_states, index) - next_states.unsqueeze(-2) - X
+        X = gather_rows(states, near.nodes) - states.unsqueeze(-2)
+        Y = gather_rows(next_states, near.nodes) - next_states.unsqueeze(-2) - X
         eye = torch.eye(states.shape[-1], dtype=states.dtype, device=states.device)
         ridge = SLOPE_RIDGE * (weight.sum(-2) * reach.square()).unsqueeze(-1) * eye
         slope = torch.linalg.solve((weight * X).mT @ X + ridge, (weight * X).mT @ Y)
@@ -155,7 +155,7 @@ class Experience(nn.Module):
 
 
 def _farthest_points(points: Tensor, count: int) -> Tensor:
-    """Indices of points each of which is the farthest from those before it; the last again if too few."""
+    """Indices of points, each the farthest from those before it; some twice if there are too few."""
     chosen = [torch.zeros(points.shape[:-2], dtype=torch.long, device=points.device)]
     distance = torch.full(points.shape[:-1], torch.inf, dtype=points.dtype, device=points.device)
     for _ in range(count - 1):

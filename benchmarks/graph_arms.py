@@ -1,0 +1,200 @@
+"""The kernels that `graph_kernels` compares, and how each is tuned, fed and judged, all in the same way.
+
+Hyper-parameters maximise the marginal likelihood of held-out trajectories: those of the graph kernels are
+tuned on a graph that lacks them, since a graph tells more of its own vertices than of new states. The sparse
+online process then learns from all trajectories in random blocks, graphs growing along.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from benchmarks.graph_pendulum import DISCOUNT, Trajectories
+from torch_gprl.gp import Posterior, SparseOnlineGP, fit_hyperparameters
+from torch_gprl.graphs import Experience, NearestEdges, ThresholdEdges, TransitionGraph
+from torch_gprl.kernels import (
+    GeodesicKernel,
+    GraphMatern,
+    Kernel,
+    Matern,
+    ShortestPathKernel,
+    SquaredExponential,
+    SuccessorKernel,
+)
+
+DIMS = 3
+BLOCK = 250  # points of one update
+MOST_NODES = 300  # of a graph of basis vectors: a budget with its overshoot
+TUNING_NODES = 100
+TUNING_POINTS = 300
+HELD_OUT = 4  # one trajectory in so many is held out of the graph while its kernel is tuned
+NEIGHBOURS = 4
+PRINTED_THRESHOLD = 0.7
+
+Graph = TransitionGraph | Experience | None
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One kernel: how to make it, and on what it stands."""
+
+    graph: Callable[[int], Graph]  # from the number of transitions that will be stored
+    kernel: Callable[[Graph], Kernel]
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A process that has learned, and the seconds that it took."""
+
+    gp: SparseOnlineGP
+    tuning: float
+    learning: float
+
+
+def _nodes(transitions: int) -> TransitionGraph:
+    return TransitionGraph(DIMS, MOST_NODES, NearestEdges(NEIGHBOURS))
+
+
+def _visited(transitions: int) -> Experience:
+    return Experience(DIMS, transitions)
+
+
+def _none(transitions: int) -> None:
+    return None
+
+
+def _on_nodes(kernel: Callable[[TransitionGraph], Kernel]) -> Arm:
+    def make(graph: Graph) -> Kernel:
+        assert isinstance(graph, TransitionGraph)
+        return kernel(graph)
+
+    return Arm(_nodes, make)
+
+
+def _on_experience(kernel: Callable[[Experience], Kernel]) -> Arm:
+    def make(graph: Graph) -> Kernel:
+        assert isinstance(graph, Experience)
+        return kernel(graph)
+
+    return Arm(_visited, make)
+
+
+def _rest() -> Kernel:
+    """What the successor kernel cannot tell."""
+    return Matern(DIMS, outputscale=0.2, smoothness=0.5)
+
+
+EUCLIDEAN = {
+    "squared exponential": Arm(_none, lambda graph: SquaredExponential(DIMS)),
+    "Matérn 1/2": Arm(_none, lambda graph: Matern(DIMS, smoothness=0.5)),
+    "Matérn 3/2": Arm(_none, lambda graph: Matern(DIMS)),
+}
+ON_GRAPHS = {
+    "shortest path, nearest (.20)": _on_nodes(lambda graph: ShortestPathKernel(graph)),
+    "shortest path, interpolated (.21)": _on_nodes(
+        lambda graph: ShortestPathKernel(graph, interpolate=NEIGHBOURS)
+    ),
+    "shortest path, Gaussian (.21)": _on_nodes(
+        lambda graph: ShortestPathKernel(graph, interpolate=NEIGHBOURS, shape="gaussian")
+    ),
+    "graph Matérn 3/2": _on_nodes(lambda graph: GraphMatern(graph, interpolate=NEIGHBOURS)),
+    "geodesic": _on_experience(lambda visited: GeodesicKernel(visited, DISCOUNT)),
+    "successor, no look-ahead": _on_experience(
+        lambda visited: SuccessorKernel(visited, DISCOUNT, lookahead=0) + _rest()
+    ),
+    "successor": _on_experience(lambda visited: SuccessorKernel(visited, DISCOUNT) + _rest()),
+}
+ARMS = EUCLIDEAN | ON_GRAPHS
+
+
+class Tuned:
+    """A kernel with hyper-parameters for some trajectories, ready to learn from them at any budget."""
+
+    def __init__(self, arm: Arm, seen: Trajectories, seed: int, steps: int, noise: float) -> None:
+        """Tune; `steps` of the optimiser, from a noise variance of `noise`."""
+        torch.manual_seed(seed)
+        self.seen = seen
+        self.graph = arm.graph(seen.targets.numel())
+        self.kernel = arm.kernel(self.graph)
+        start = time.perf_counter()
+        kept = torch.arange(len(seen.targets)) % HELD_OUT != 0
+        grow(self.graph, seen, kept)
+        gp = SparseOnlineGP(self.kernel, TUNING_NODES, noise)
+        held_out, targets = seen.states[~kept].flatten(0, 1), seen.targets[~kept].flatten()
+        chosen = torch.randperm(len(targets))[:TUNING_POINTS]
+        fit_hyperparameters(gp, held_out[chosen], targets[chosen], steps, noise_floor=noise / 4)
+        self.noise = gp.noise_variance.detach()
+        if isinstance(self.graph, Experience):
+            grow(self.graph, seen, ~kept)
+        self.seconds = time.perf_counter() - start
+
+    @torch.no_grad()
+    def learn(self, budget: int, seed: int) -> Learned:
+        """Learn all trajectories with so many basis vectors."""
+        if isinstance(self.graph, TransitionGraph):
+            self.graph.eliminate(self.graph.mask)
+        gp = SparseOnlineGP(self.kernel, budget, self.noise)
+        start = time.perf_counter()
+        order = torch.randperm(self.seen.targets.numel(), generator=torch.Generator().manual_seed(seed))
+        states, targets = self.seen.states.flatten(0, 1), self.seen.targets.flatten()
+        for block in order.split(BLOCK):
+            gp.update(states[block], targets[block])
+            if isinstance(self.graph, TransitionGraph):
+                self.graph.follow(gp.basis, gp.mask)
+        return Learned(gp, self.seconds, time.perf_counter() - start)
+
+
+def grow(graph: Graph, seen: Trajectories, which: Tensor) -> None:
+    """Store trajectories in a graph; a graph of basis vectors gets some of their states, spread out."""
+    if graph is None:
+        return
+    states, next_states = seen.states[which].flatten(0, 1), seen.next_states[which].flatten(0, 1)
+    if isinstance(graph, Experience):
+        graph.add(states, next_states)
+    else:
+        spread = Experience(DIMS, len(states), TUNING_NODES)
+        spread.add(states, next_states)
+        graph.add(states[spread.landmarks])
+
+
+def printed(
+    seen: Trajectories, queries: Float[Tensor, "N D"], extension: str, noise: float, nodes: int
+) -> Posterior:
+    """Equations (.18) to (.21) to the letter: squared edges, Gaussian of P, one leg, raw weights.
+
+    The matrix is not positive semi-definite, and a process on it has negative variances: what remains is
+    least squares on k(x, ·) at the nodes, with its residual variance everywhere.
+
+    Args:
+        seen: data.
+        queries: where to predict.
+        extension: ".20" or ".21".
+        noise: ridge of least squares.
+        nodes: basis vectors, spread out over the states.
+    """
+    graph = TransitionGraph(DIMS, nodes, ThresholdEdges(PRINTED_THRESHOLD, squared=True))
+    visited = Experience(DIMS, seen.targets.numel(), nodes)
+    states, targets = seen.states.flatten(0, 1), seen.targets.flatten()
+    visited.add(states, seen.next_states.flatten(0, 1))
+    graph.add(states[visited.landmarks])
+    # no path is no correlation; the sum of (.21) needs a number for it, and takes the longest path
+    paths = graph.paths.where(graph.paths.isfinite(), graph.paths[graph.paths.isfinite()].max())
+
+    def covariance(x: Tensor) -> Tensor:
+        square = torch.cdist(x, graph.points).square()
+        if extension == ".20":
+            leg, nearest = square.min(-1)
+            length = leg.unsqueeze(-1) + paths[nearest]
+        else:
+            length = (-square / 2).exp() @ paths
+        return (-length.square() / 2).exp()
+
+    K = covariance(states)
+    eye = torch.eye(nodes, dtype=K.dtype)
+    weights = torch.linalg.solve(K.mT @ K + noise * eye, K.mT @ targets)
+    variance = (K @ weights - targets).square().mean()
+    return Posterior(covariance(queries) @ weights, variance.expand(len(queries)))

@@ -25,6 +25,9 @@ SHORTEST_EDGE = 1e-6  # conductance of an edge is 1/length²; copies of one poin
 class NodeKernel(GraphKernel):
     """A kernel given on the nodes of a graph, and carried from them to all other inputs.
 
+    With the basis of a Gaussian process as nodes, `kernel.graph.follow(gp.basis, gp.mask)` after its updates
+    lets the graph grow and shrink with it; the process notices by itself.
+
     Args:
         graph: one graph for each learner of its batch; may grow and shrink at any time.
         lengthscale: ℓ, in units of the inputs; broadcasts to the batch of the graph.

@@ -25,14 +25,14 @@ UPDATE = {
 }
 
 
-def shown(terminal: bool, times: list[float]) -> str:
+def shown(terminal: bool, times: list[float], update: dict[str, torch.Tensor] = UPDATE) -> str:
     """What is shown after updates of 100 steps each at these seconds."""
     clock = Clock()
     console = Console(file=io.StringIO(), force_terminal=terminal, width=100, color_system=None)
     with Progress(1000, "pendulum", console=console, clock=clock) as progress:
         for number, seconds in enumerate(times, start=1):
             clock.now = 1000.0 + seconds
-            progress.update(100 * number, UPDATE)
+            progress.update(100 * number, update)
     return console.file.getvalue()
 
 
@@ -69,3 +69,9 @@ def test_a_run_without_exploration_or_basis_is_shown_too():
 def test_an_error_inside_passes_through():
     with pytest.raises(KeyboardInterrupt), Progress(1, "", console=Console(file=io.StringIO())):
         raise KeyboardInterrupt
+
+
+def test_there_is_no_return_before_an_episode_has_ended():
+    none, some = torch.tensor([torch.nan, torch.nan]), torch.tensor([torch.nan, 7.0])
+    assert "return –  " in shown(False, [10.0], UPDATE | {"return": none})
+    assert "return 7  " in shown(False, [10.0], UPDATE | {"return": some})

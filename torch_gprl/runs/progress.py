@@ -81,8 +81,10 @@ class Progress:
 
 
 def _mean_and_spread(values: Tensor) -> str:
-    """The mean over learners, with the standard deviation between them where there are several."""
-    values = values.double()
+    """Mean over the learners that have a value, and the standard deviation between them."""
+    values = values[values.isfinite()].double()
+    if not len(values):
+        return "–"  # no episode has ended yet
     mean = f"{values.mean().item():.4g}"
     return f"{mean} ± {values.std().item():.2g}" if len(values) > 1 else mean
 

@@ -124,7 +124,9 @@ def _generalised(seen: Evaluation) -> Tensor:
     # not TorchRL's vectorised form, which fails for λ = 0; plain numbers would be rounded to single precision
     discount, trace = (seen.value.new_tensor(rate) for rate in (seen.discount, seen.trace))
     advantage, _ = generalized_advantage_estimate(
-        discount, trace, *(column.unsqueeze(-1) for column in columns)
+        discount,  # pyright: ignore[reportArgumentType]
+        trace,  # pyright: ignore[reportArgumentType]
+        *(column.unsqueeze(-1) for column in columns),
     )
     return advantage.squeeze(-1)
 

@@ -60,7 +60,7 @@ class RunOptions:
 
     task: str = "pendulum-swingup"  # id of the task; a wrong one lists all
     learners: int = 5  # independent learners, trained side by side; the learning curve shows their spread
-    num_envs: int = 16  # environments of each learner, stepped together
+    num_envs: int = 5  # environments of each learner, stepped together
     seed: int = 0  # of all random numbers; the evaluation has a seed of its own
     threads: int = 1  # processor threads of torch and of the simulator
     device: str = "cpu"  # where policy and critic live: cpu, cuda, cuda:1, ...

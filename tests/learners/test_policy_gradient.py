@@ -34,7 +34,7 @@ def pendulums(learners: int = 3, first_learner: int = 0, task: str = "pendulum-s
 
 
 def config(updates: int = 4, **numbers: Any) -> PolicyGradientConfig:
-    defaults = {"rollout_steps": STEPS, "budget": 30, "horizon": 20}
+    defaults = {"rollout_steps": STEPS, "budget": 30, "horizon": 20, "estimator": "k-step-baseline"}
     return PolicyGradientConfig(total_frames=updates * ENVS * STEPS, **(defaults | numbers))
 
 
@@ -157,7 +157,7 @@ def test_actions_are_weighed_by_the_critic_of_the_moment(name, in_sample):
     learner, rollout = weighed(estimator=name, in_sample=in_sample)
     assert rollout["next", "terminated"].any()  # else the test would say nothing of ends
     assert learner.critic.gp.clock == int(in_sample)  # the update whose experience it learned last
-    expected = GPValueEstimator(learner.critic, learner.policy, 0.98, name, 20)(rollout.clone())
+    expected = GPValueEstimator(learner.critic, learner.policy, 0.98, name, 20, 0.9)(rollout.clone())
     for key in ("advantage", "value_target"):
         torch.testing.assert_close(rollout[key], expected[key], rtol=1e-8, atol=1e-8)
 

@@ -38,14 +38,14 @@ SHARES = ("discount", "trace", "age_weight")
 class PolicyGradientConfig:
     """Policy gradients with a Gaussian-process critic."""
 
-    total_frames: int = 240_000  # environment steps per learner, over all its environments
+    total_frames: int = 120_000  # environment steps per learner, over all its environments
     rollout_steps: int = 200  # steps of each environment between two policy updates
     discount: float = 0.98  # γ per environment step, from 0 to 1
     discount_states: bool = False  # weigh step t of an episode by γ^t, the gradient of the discounted return
 
-    estimator: EstimatorName = "k-step-baseline"  # how good an action was; torch_gprl.critics.estimators
+    estimator: EstimatorName = "generalised"  # how good an action was; torch_gprl.critics.estimators
     horizon: int = 200  # real rewards before the critic's value takes over, in the k-step estimators
-    trace: float = 0.95  # λ of the estimator "generalised", from 0 to 1
+    trace: float = 0.9  # λ of the estimator "generalised", from 0 to 1
 
     controller: ControllerForm = "mlp"  # form of the controller f(s)
     std: float = 0.5  # initial exploration standard deviation, in halves of the actuator's range
@@ -61,8 +61,8 @@ class PolicyGradientConfig:
     novelty_threshold: float = 0.3  # novelty that makes a point a basis vector, in noise variances
     renew_every: int = 20  # policy updates between renewals of the critic, which forget older data; 1: each
     replay: int = 0  # environment steps per learner, solved anew at each update; differences only, 0 is off
-    noise: float = 0.1  # noise variance of temporal differences, in variances of the reward
-    lengthscale: float = 0.5  # of observations, in their standard deviations times √columns; differences
+    noise: float = 0.02  # noise variance of temporal differences, in variances of the reward
+    lengthscale: float = 0.3  # of observations, in their standard deviations times √columns; differences
     action_lengthscale: float = 12.0  # of actions, in their standard deviations; differences
     age_weight: float = 0.0  # λ: pruning by information (0) or by age (1)
     age_form: AgeForm = "exponential"  # of the age in the pruning score

@@ -104,7 +104,7 @@ def test_without_experience_one_kernel_is_ordinary_and_the_other_knows_nothing()
     empty, x = Experience(2, 60, 12), inputs(6)
     geodesic = GeodesicKernel(empty, DISCOUNT, 0.8, 1.3)
     torch.testing.assert_close(geodesic(x, x), Matern(2, 0.8, 1.3, smoothness=0.5)(x, x))
-    assert not SuccessorKernel(empty, DISCOUNT)(x, x).any()
+    assert float(SuccessorKernel(empty, DISCOUNT)(x, x).max()) < 1e-10
 
 
 def test_on_merging_trajectories_the_laplacian_is_the_prior_of_bellman_with_white_rewards():
@@ -194,6 +194,24 @@ def test_following_inputs_ahead_finds_the_values_of_a_known_system():
         errors[lookahead] = float((found - value(x)).square().mean().sqrt() / value(x).std())
     assert errors[8] < 0.05
     assert errors[8] < errors[0] / 2
+
+
+def test_where_the_nearest_states_disagree_the_prior_stays_wide():
+    """On a ridge two trajectories part; an input between them may have either fate."""
+    upper = torch.stack([torch.linspace(0, 9, 10), torch.linspace(0.1, 4, 10)], -1).double()
+    lower = upper * torch.tensor([1.0, -1.0])
+    experience = Experience(2, 60, 18, interpolate=2)
+    experience.add(torch.cat([upper[:-1], lower[:-1]]), torch.cat([upper[1:], lower[1:]]))
+    kernel = SuccessorKernel(experience, DISCOUNT, 1.0, 1.0, 0)
+
+    def undecided(x: Tensor) -> float:
+        return float((kernel.features(x)[1].square() / kernel.diag(x)).detach())
+
+    visited, between = upper[2:3], upper[2:3] * torch.tensor([1.0, 0.0])
+    assert undecided(visited) < 1e-9
+    assert undecided(between) > 0.05
+    kernel.doubt = 2 * kernel.doubt.detach()
+    assert undecided(visited) < 1e-9
 
 
 def test_options_out_of_range_are_named():

@@ -51,10 +51,10 @@ class TableKernel(Kernel):
 
     @abstractmethod
     def _build_features(self, x: Tensor, table: Table) -> Factors:
-        """Factors of F at x [*batch, N, D]."""
+        """Two tensors [*batch, N, …] for each row of x [*batch, N, D]."""
 
     def features(self, x: Inputs) -> Factors:
-        """Left and right factor such that left(x) right(z)ᵀ = F(x) F(z)ᵀ: [*batch, N, R] each."""
+        """What the covariance needs of x [*batch, N, D], see `_build_features`."""
         sources = [*self.parameters(), *self.buffers()]
         x = x.to(sources[0].dtype)
         if torch.is_grad_enabled() and (x.requires_grad or any(source.requires_grad for source in sources)):
@@ -103,7 +103,8 @@ class GraphKernel(TableKernel):
         left, right = self.features(x)
         other_left, other_right = (left, right) if z is x else self.features(z)
         rest, other_rest = _left_open(left, right), _left_open(other_left, other_right)
-        leftover = rest.unsqueeze(-1) * other_rest.unsqueeze(-2) * self._euclidean(x, z)
+        log_lengthscale = self.log_lengthscale.unsqueeze(-1).expand(*self.batch_shape, self.input_dim)
+        leftover = rest.unsqueeze(-1) * other_rest.unsqueeze(-2) * exponential(x, z, log_lengthscale)
         return self.outputscale[..., None, None] * (left @ other_right.mT + leftover)
 
     def diag(self, x: Inputs) -> PerPoint:
@@ -111,11 +112,11 @@ class GraphKernel(TableKernel):
         batch = torch.broadcast_shapes(x.shape[:-2], self.batch_shape)
         return self.outputscale.unsqueeze(-1).expand(*batch, x.shape[-2])
 
-    def _euclidean(self, x: Tensor, z: Tensor) -> Tensor:
-        """exp(−|x − z|/ℓ)."""
-        log_lengthscale = self.log_lengthscale.unsqueeze(-1).expand(*self.batch_shape, self.input_dim)
-        square = -2 * log_gaussian(x, z, log_lengthscale)
-        return (-square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()).exp()
+
+def exponential(x: Tensor, z: Tensor, log_lengthscale: Tensor) -> Tensor:
+    """exp(−r) with r the distance in units of ℓ [*batch, D]: the Matérn 1/2 correlation [*batch, N, M]."""
+    square = -2 * log_gaussian(x, z, log_lengthscale)
+    return (-square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()).exp()
 
 
 def _left_open(left: Tensor, right: Tensor) -> Tensor:

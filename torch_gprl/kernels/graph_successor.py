@@ -6,7 +6,9 @@ Directed, and positive semi-definite by construction. The features M φ are Daya
 representation; as a prior of values it is that of Engel et al. (2005) with the transitions known.
 
 Inputs off the graph are followed ahead: x, its expected successor, and so on, for some steps before the last
-one borrows from the vertices near it. That is what finds the side of a ridge on which an input lies.
+one borrows from the vertices near it. That is what finds the side of a ridge on which an input lies. Where
+these vertices disagree, the variance that their average loses is kept, and so is a part of that of the
+vertices nearest to the input itself: near a ridge the prior stays wide.
 
 | paper | here | meaning |
 |---|---|---|
@@ -22,16 +24,19 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
 from torch_gprl.graphs.experience import Experience
+from torch_gprl.graphs.interpolation import Neighbours
 from torch_gprl.kernels.distance import log_gaussian
-from torch_gprl.kernels.graph import Factors, Table, TableKernel
+from torch_gprl.kernels.graph import SMALLEST_REST, Factors, Table, TableKernel, exponential
 from torch_gprl.kernels.graph_geodesic import check_discount
 from torch_gprl.kernels.parameters import Positive, PositiveValue, log_parameter
 from torch_gprl.linalg import cholesky
 from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
 
+FIRST_DOUBT = 0.1  # part of the disagreement of the nearest states that following ahead does not settle
+
 
 class SuccessorKernel(TableKernel):
-    """σ² (Mφ)(x) (Mφ)(z)ᵀ, scaled to a prior variance that is σ² on average over visited states.
+    """σ² ((Mφ)(x) (Mφ)(z)ᵀ + what is undecided), of mean prior variance σ² over visited states.
 
     It knows nothing where there is no experience, and the transitions of others are a guess: add an ordinary
     kernel, `SuccessorKernel(…) + Matern(…)`, for what it cannot tell.
@@ -49,6 +54,7 @@ class SuccessorKernel(TableKernel):
 
     lengthscale = Positive()
     outputscale = Positive()
+    doubt = Positive()
 
     def __init__(
         self,
@@ -65,20 +71,22 @@ class SuccessorKernel(TableKernel):
             raise ValueError(f"lookahead must be at least 0 steps, got {lookahead}")
         self.log_lengthscale = log_parameter(lengthscale, "lengthscale", (*batch, dims))
         self.log_outputscale = log_parameter(outputscale, "outputscale", batch)
+        self.log_doubt = log_parameter(FIRST_DOUBT, "doubt", batch)
         self.experience = experience
         self.discount = discount
         self.lookahead = lookahead
 
     def forward(self, x: Inputs, z: OtherInputs) -> CrossMatrix:
         """Covariance of x [*batch, N, D] with z [*batch, M, D]: [*batch, N, M]."""
-        left, _ = self.features(x)
-        right = left if z is x else self.features(z)[1]
-        return self.outputscale[..., None, None] * (left @ right.mT)
+        features, rest = self.features(x)
+        others, other_rest = (features, rest) if z is x else self.features(z)
+        undecided = rest @ other_rest.mT * exponential(x, z, self.log_lengthscale)
+        return self.outputscale[..., None, None] * (features @ others.mT + undecided)
 
     def diag(self, x: Inputs) -> PerPoint:
         """Prior variance at x [*batch, N, D]: [*batch, N]."""
-        left, right = self.features(x)
-        return self.outputscale.unsqueeze(-1) * torch.linalg.vecdot(left, right)
+        features, rest = self.features(x)
+        return self.outputscale.unsqueeze(-1) * (features.square().sum(-1) + rest.squeeze(-1).square())
 
     def _build_table(self) -> Table:
         """Landmarks, the inverse of their factor, and Mφ of every vertex [*batch, C, L], all scaled."""
@@ -111,10 +119,14 @@ class SuccessorKernel(TableKernel):
         return _resolve(nodes, weights * going.unsqueeze(-1), rewards)
 
     def _build_features(self, x: Tensor, table: Table) -> Factors:
+        """F [*batch, N, L], and the root of the variance that is left undecided [*batch, N, 1]."""
         landmarks, inverse, vertices = table
         ahead, left, reached = self._follow(x, landmarks, inverse)
-        features = ahead + left.unsqueeze(-1) * self.experience.nearest(reached).average(vertices)
-        return features, features
+        left = left.unsqueeze(-1)
+        average, spread = _agreement(self.experience.nearest(reached), vertices)
+        _, spread_here = _agreement(self.experience.nearest(x), vertices)
+        undecided = left.square() * spread + self.doubt[..., None, None] * spread_here
+        return ahead + left * average, undecided.clamp_min(SMALLEST_REST).sqrt()
 
     def _follow(self, x: Tensor, landmarks: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Discounted φ along the expected way from x, the weight of what follows, and where that is."""
@@ -129,6 +141,13 @@ class SuccessorKernel(TableKernel):
 
     def _reward_features(self, x: Tensor, landmarks: Tensor, inverse: Tensor) -> Tensor:
         return log_gaussian(x, landmarks, self.log_lengthscale).exp() @ inverse.mT
+
+
+def _agreement(found: Neighbours, values: Tensor) -> tuple[Tensor, Tensor]:
+    """What vertices say on average [*batch, N, L], and how much they disagree: Σ w |v|² − |Σ w v|²."""
+    average = found.average(values)
+    norms = found.average(values.square().sum(-1, keepdim=True))
+    return average, norms - average.square().sum(-1, keepdim=True)
 
 
 def _resolve(nodes: Tensor, weights: Tensor, right: Tensor) -> Tensor:

@@ -32,14 +32,15 @@ from torch_gprl.kernels.parameters import Positive, PositiveValue, log_parameter
 from torch_gprl.linalg import cholesky
 from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
 
-FIRST_DOUBT = 0.1  # part of the disagreement of the nearest states that following ahead does not settle
+FIRST_DOUBT = 0.1  # until it is set or fitted
 
 
 class SuccessorKernel(TableKernel):
     """σ² ((Mφ)(x) (Mφ)(z)ᵀ + what is undecided), of mean prior variance σ² over visited states.
 
     It knows nothing where there is no experience, and the transitions of others are a guess: add an ordinary
-    kernel, `SuccessorKernel(…) + Matern(…)`, for what it cannot tell.
+    kernel, `SuccessorKernel(…) + Matern(…)`, for what it cannot tell. A further parameter, `doubt`, is the
+    part of the disagreement of the nearest states that following an input ahead does not settle.
 
     Args:
         experience: visited states and transitions; may grow at any time.

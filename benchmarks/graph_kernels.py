@@ -81,8 +81,8 @@ def main(options: Options) -> None:
             scores += found
             print(f"{problem.name}, seed {seed}: {best(found)}", flush=True)
             if seed == 0:
-                draw_surfaces(truth, surfaces, options.out / f"surfaces_{problem.name}.png")
-                draw_graph(truth, seen, options.out / f"graph_{problem.name}.png")
+                draw_surfaces(truth, surfaces, options.out / f"surfaces_{problem.file_name}.png")
+                draw_graph(truth, seen, options.out / f"graph_{problem.file_name}.png")
                 graphs += connectivity(problem, seen)
         write(scores, graphs, options)
     show(scores)
@@ -102,7 +102,7 @@ def compare(
     scores: list[Score] = []
 
     def keep(kernel: str, budget: int, posterior: Posterior, seconds: tuple[float, float, float]) -> None:
-        surfaces[kernel] = posterior.mean
+        surfaces[f"{kernel}, {MEMORY} kept" if budget == MEMORY else kernel] = posterior.mean
         scores.append(Score(problem.name, kernel, budget, seed, *errors(truth, posterior), *seconds))
 
     for name, arm in ARMS.items():
@@ -178,9 +178,7 @@ def mean(runs: list[Score], key: str) -> float:
 
 def write(scores: list[Score], graphs: list[dict[str, object]], options: Options) -> None:
     """Leave all figures with what they were made by."""
-    settings = {
-        key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()
-    }
+    settings = {key: value for key, value in asdict(options).items() if key != "out"}
     content = {"options": settings, "graphs": graphs, "scores": [asdict(score) for score in scores]}
     (options.out / "graph_kernels.json").write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 

@@ -38,6 +38,11 @@ class Problem:
         """How results are called."""
         return f"{self.policy}, noise {self.action_noise:g}" if self.action_noise else self.policy
 
+    @property
+    def file_name(self) -> str:
+        """The name without spaces and commas."""
+        return self.name.replace(",", "").replace(" ", "_")
+
 
 @dataclass(frozen=True)
 class Truth:

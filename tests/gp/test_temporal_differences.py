@@ -77,6 +77,11 @@ def test_bad_successors_are_refused_and_change_nothing() -> None:
     after[3] = torch.inf
     with pytest.raises(ValueError, match="finite"):
         gp.update(points[:-1], rewards, next_inputs=after, discount=discount)
+    spread = torch.full((10, 1), torch.nan, dtype=F64)
+    with pytest.raises(ValueError, match="variance of next_inputs must be finite"):
+        gp.update(
+            points[:-1], rewards, next_inputs=GaussianInputs(points[1:], spread, (1,)), discount=discount
+        )
     assert int(gp.size) == 0
     assert int(gp.observations) == 0
 

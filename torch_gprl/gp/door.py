@@ -52,7 +52,7 @@ def admit_data(
         targets = torch.where(mask, targets, 0.0)
     if not bool(torch.isfinite(inputs.sum() + targets.sum())):  # one synchronisation; details only on failure
         for name, tensor in (("inputs", inputs), ("targets", targets)):
-            _refuse_non_finite(name, tensor)
+            refuse_non_finite(name, tensor)
     return inputs, targets, mask
 
 
@@ -61,7 +61,8 @@ def _broadcasts(shape: torch.Size, target: torch.Size) -> bool:
     return len(padded) == len(target) and all(a in (1, b) for a, b in zip(padded, target, strict=True))
 
 
-def _refuse_non_finite(name: str, tensor: Tensor) -> None:
+def refuse_non_finite(name: str, tensor: Tensor) -> None:
+    """Raise a ValueError that names the first NaN or infinity in `tensor`, if there is any."""
     bad = ~torch.isfinite(tensor)
     if bool(bad.any()):
         where = bad.nonzero()[0].tolist()

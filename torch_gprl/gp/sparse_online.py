@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torch_gprl.gp.door import admit_data
+from torch_gprl.gp.door import admit_data, refuse_non_finite
 from torch_gprl.gp.pruning import InformationScore, PruningScore, Whitened, basis_statistics, keep_first
 from torch_gprl.gp.selection import Selection, select_novel
 from torch_gprl.gp.whitened import NOVELTY_FLOOR, WhitenedState, solve_triangular
@@ -164,6 +164,8 @@ class SparseOnlineGP(WhitenedState):
         counts = rate != 0 if mask is None else mask & (rate != 0)
         mean, rate, _ = admit_data(next_inputs.mean, rate, counts, self.batch_shape, self.basis)
         variance = next_inputs.variance.to(mean.dtype).expand(*mean.shape[:-1], -1)
+        variance = torch.where(counts.unsqueeze(-1), variance, 0.0)
+        refuse_non_finite("variance of next_inputs", variance)
         return Observed(inputs, targets, mask, GaussianInputs(mean, variance, next_inputs.columns), rate)
 
     def _absorb_block(self, block: Observed, noise: Tensor) -> None:
@@ -173,7 +175,9 @@ class SparseOnlineGP(WhitenedState):
         # moment: W = 1/(σ0² + ν); dtc ignores what the basis misses
         variance = noise + novelty if self.projection == "moment" else noise.expand_as(novelty)
         self._accumulate(phi, variance, block.targets, block.mask)
-        room = min(self.overshoot, -(-block.inputs.shape[-2] // CHURN))  # for additions of the next block
+        # room for the additions of a next block like this one, by the points that count
+        points = block.targets.shape[-1] if block.mask is None else block.mask.sum(-1).clamp_min(1)
+        room = torch.as_tensor(-(-points // CHURN), device=self.size.device).clamp_max(self.overshoot)
         full = self.size > self.capacity - room
         if bool(full.any()):
             self._prune(full)

@@ -1,13 +1,28 @@
 """Policies: deterministic controllers f(s, θ) and the exploration round them."""
 
-from torch_gprl.policies.controllers import Controller, LinearController, MLPController, RBFController
-from torch_gprl.policies.gaussian import GaussianPolicy, gaussian_policy
+from torch_gprl.policies.confidence_noise import ConfidenceNoise, ConfidenceScale, Greedy, action_box
+from torch_gprl.policies.controllers import (
+    Controller,
+    LinearController,
+    MLPController,
+    RBFController,
+    ScaledController,
+)
+from torch_gprl.policies.gaussian import GaussianPolicy, NormalPolicy, gaussian_policy
+from torch_gprl.policies.streams import NoiseStream
 
 __all__ = [
+    "ConfidenceNoise",
+    "ConfidenceScale",
     "Controller",
     "GaussianPolicy",
+    "Greedy",
     "LinearController",
     "MLPController",
+    "NoiseStream",
+    "NormalPolicy",
     "RBFController",
+    "ScaledController",
+    "action_box",
     "gaussian_policy",
 ]

@@ -156,3 +156,25 @@ class MLPController(Controller):
         for hidden_weight, hidden_bias in layers:
             features = torch.tanh(features @ hidden_weight + hidden_bias)
         return features @ weight + bias
+
+
+class ScaledController(nn.Module):
+    """A controller in the actuator's units: 0 is the middle of its range, ±1 are its bounds.
+
+    Args:
+        controller: f(s, θ).
+        low, high: bounds of the action, [A] each.
+    """
+
+    centre: Float[Tensor, " A"]
+    half_range: Float[Tensor, " A"]
+
+    def __init__(self, controller: Controller, low: Float[Tensor, " A"], high: Float[Tensor, " A"]) -> None:
+        super().__init__()
+        self.controller = controller
+        self.register_buffer("centre", (high + low) / 2)
+        self.register_buffer("half_range", (high - low) / 2)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Actions [*batch, ..., A] at observations [*batch, ..., D]."""
+        return self.centre + self.half_range * self.controller(observation)

@@ -3,6 +3,7 @@
 # tensordict wraps the methods of its modules in decorators that hide their signatures:
 # pyright: reportIncompatibleVariableOverride=false
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -23,8 +24,25 @@ from torch_gprl.policies.controllers import Controller
 from torch_gprl.policies.streams import NoiseStream
 
 
-class GaussianHead(TensorDictModuleBase):
+class ActionHead(TensorDictModuleBase, ABC):
     """Writes the mean `loc` and the standard deviation `scale` of the action, in the actuator's units."""
+
+    def __init__(self, observation_key: str) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = [observation_key], ["loc", "scale"]
+
+    @abstractmethod
+    def parameters_at(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation [*batch, ..., A] of the action at observations [*batch, ..., D]."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `loc` and `scale`."""
+        loc, scale = self.parameters_at(tensordict.get(self.in_keys[0]))
+        return tensordict.set("loc", loc).set("scale", scale)
+
+
+class GaussianHead(ActionHead):
+    """A controller and a standard deviation of its own for every dimension of the action."""
 
     centre: Float[Tensor, " A"]
     half_range: Float[Tensor, " A"]
@@ -32,8 +50,7 @@ class GaussianHead(TensorDictModuleBase):
     def __init__(
         self, controller: Controller, low: Tensor, high: Tensor, std: float, observation_key: str
     ) -> None:
-        super().__init__()
-        self.in_keys, self.out_keys = [observation_key], ["loc", "scale"]
+        super().__init__(observation_key)
         self.controller = controller
         self.register_buffer("centre", (high + low) / 2)
         self.register_buffer("half_range", (high - low) / 2)
@@ -47,21 +64,16 @@ class GaussianHead(TensorDictModuleBase):
         middle = (1,) * (loc.ndim - std.ndim)
         return loc, std.reshape(*std.shape[:-1], *middle, std.shape[-1]).expand_as(loc)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `loc` and `scale`."""
-        loc, scale = self.parameters_at(tensordict.get(self.in_keys[0]))
-        return tensordict.set("loc", loc).set("scale", scale)
 
-
-class GaussianPolicy(ProbabilisticTensorDictSequential):
-    """A Gaussian round a controller, as TorchRL's losses and collectors take a policy.
+class NormalPolicy(ProbabilisticTensorDictSequential):
+    """Normally distributed actions, as TorchRL's losses and collectors take a policy.
 
     Writes `loc`, `scale`, `action` and `action_log_prob`. With a `noise` stream, what learner i draws does
     not depend on the other learners; acting is then one fused step instead of TorchRL's chain of modules.
     """
 
     def __init__(
-        self, head: GaussianHead, noise: NoiseStream | None = None, action_key: str = "action"
+        self, head: ActionHead, noise: NoiseStream | None = None, action_key: str = "action"
     ) -> None:
         sampler = ProbabilisticTensorDictModule(
             in_keys=["loc", "scale"],
@@ -73,6 +85,23 @@ class GaussianPolicy(ProbabilisticTensorDictSequential):
         super().__init__([head, sampler])
         self.noise = noise
         self.action_key = action_key
+
+    def forward(self, tensordict: TensorDictBase, *args: object, **kwargs: object) -> TensorDictBase:
+        """Write the distribution's parameters, an action and its log-probability."""
+        if self.noise is None or not explores():
+            return super().forward(tensordict, *args, **kwargs)
+        head = self.module[0]
+        assert isinstance(head, ActionHead)
+        loc, scale = head.parameters_at(tensordict.get(head.in_keys[0]))
+        noise = self.noise.draw(loc.reshape(len(self.noise), -1, loc.shape[-1])).reshape(loc.shape)
+        # log N(a; f, σ²I) with a − f = σ ε
+        log_prob = -(0.5 * noise.square() + scale.log() + 0.5 * LOG_2PI).sum(-1)
+        tensordict.set("loc", loc).set("scale", scale).set(self.action_key, loc + scale * noise)
+        return tensordict.set(f"{self.action_key}_log_prob", log_prob)
+
+
+class GaussianPolicy(NormalPolicy):
+    """A Gaussian of a standard deviation of its own round a controller."""
 
     @property
     def head(self) -> GaussianHead:
@@ -86,17 +115,10 @@ class GaussianPolicy(ProbabilisticTensorDictSequential):
         """Standard deviation of the exploration, in the actuator's units."""
         return (self.head.half_range * self.head.log_std.exp()).detach()
 
-    def forward(self, tensordict: TensorDictBase, *args: object, **kwargs: object) -> TensorDictBase:
-        """Write the distribution's parameters, an action and its log-probability."""
-        random = interaction_type() in (InteractionType.RANDOM, None)
-        if self.noise is None or not random:
-            return super().forward(tensordict, *args, **kwargs)
-        loc, scale = self.head.parameters_at(tensordict.get(self.head.in_keys[0]))
-        noise = self.noise.draw(loc.reshape(len(self.noise), -1, loc.shape[-1])).reshape(loc.shape)
-        # log N(a; f, σ²I) with a − f = σ ε
-        log_prob = -(0.5 * noise.square() + scale.log() + 0.5 * LOG_2PI).sum(-1)
-        tensordict.set("loc", loc).set("scale", scale).set(self.action_key, loc + scale * noise)
-        return tensordict.set(f"{self.action_key}_log_prob", log_prob)
+
+def explores() -> bool:
+    """Whether TorchRL's exploration type asks for random actions, as it does unless told otherwise."""
+    return interaction_type() in (InteractionType.RANDOM, None)
 
 
 LOG_2PI = 1.8378770664093453

@@ -41,8 +41,8 @@ class BatchEnv(EnvBase):
     def __init__(self, task: Task, options: Options) -> None:
         self._shape = torch.Size([options.learners, options.num_envs])
         super().__init__(device=torch.device(options.device), batch_size=self._shape)
-        self._to = (self.device, options.dtype)
         self.task, self.options = task, options
+        self._place_outputs()
         self.plane: Plane | None = task.plane
         self._copies = Copies(task, options)
         self._pictures = Pictures(task)
@@ -81,8 +81,12 @@ class BatchEnv(EnvBase):
     def to(self, device: torch.device | str | int) -> "BatchEnv":
         """Give outputs on another device; the simulation stays where it is."""
         super().to(device)
-        self._to = (self.device, self.options.dtype)
+        self._place_outputs()
         return self
+
+    def _place_outputs(self) -> None:
+        self._to = (self.device, self.options.dtype)
+        self._on_host = self._to[0].type == "cpu"  # a cast to where a tensor already is costs microseconds
 
     def _make_specs(self) -> None:
         """Read the observation's size and the reward's parts off a trial state."""
@@ -153,11 +157,12 @@ class BatchEnv(EnvBase):
         # The next step begins with all that this one had, and all that came after it but the reward.
         entries = dict(tensordict.items()) | outcome
         for key, value in entries.items():
-            if isinstance(value, TensorDictBase):
+            if type(value) is not Tensor and isinstance(value, TensorDictBase):
                 entries[key] = value.copy()
         del entries["reward"]
         entries.pop("_reset", None)
-        tensordict.set("next", TensorDict._new_unsafe(outcome, self._shape, device=device))
+        step = TensorDict._new_unsafe(outcome, self._shape, device=device)
+        tensordict._set_str("next", step, validated=True, inplace=False, non_blocking=False)
         following = TensorDict._new_unsafe(entries, self._shape, device=device)
         return tensordict, self.maybe_reset(following) if outcome["done"].any() else following
 
@@ -193,11 +198,13 @@ class BatchEnv(EnvBase):
 
     def _out(self, value: Tensor) -> Tensor:
         """Numbers [B] or [B, n] as `[learners, num_envs, 1 or n]` in the output's dtype, on its device."""
-        return value.to(*self._to).view(self._shapes[value.ndim])
+        value = value.view(self._shapes[value.ndim]).to(self._to[1])
+        return value if self._on_host else value.to(self._to[0])
 
     def _flag(self, value: Tensor) -> Tensor:
         """Flags [B] as `[learners, num_envs, 1]` on the output's device."""
-        return value.to(self._to[0]).view(self._shapes[1])
+        value = value.view(self._shapes[1])
+        return value if self._on_host else value.to(self._to[0])
 
     def render(
         self, learner: int = 0, env: int = 0, width: int = 480, height: int = 480

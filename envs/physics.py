@@ -169,7 +169,7 @@ class MujocoPhysics(Physics):
         """Where MuJoCo had to reset a copy, or left it beyond `LARGEST`; see `Physics.diverged`."""
         # A sum of squares within the bound's square proves all entries within the bound; NaN fails the test.
         state = self.batch.state
-        if np.vdot(state, state) <= LARGEST**2 and not self.batch.warning.any():
+        if np.vdot(state, state) <= LARGEST**2 and not np.count_nonzero(self.batch.warning):
             return None
         lost = np.stack([self.batch.warning[:, warning, 1] > 0 for warning in BAD_STATE])
         self.batch.warning[:] = 0

@@ -42,7 +42,7 @@ def shared(path: Path) -> mujoco.MjModel:
 
 def squares(action: Float[Tensor, "B da"]) -> Float[Tensor, " B"]:
     """Σ a² in float32 and in NumPy's order, float32."""
-    return torch.from_numpy(np.square(action.float().numpy()).sum(axis=-1))
+    return torch.from_numpy(np.add.reduce(np.square(action.float().numpy()), axis=-1))
 
 
 def numpy_sum(values: Float[Tensor, "B ..."]) -> Float[Tensor, " B"]:

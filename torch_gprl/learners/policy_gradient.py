@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.collectors import Collector
-from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs import EnvBase
 
 from torch_gprl.critics import USE_ALL_ACTIONS, Evaluation, GPValueEstimator
+from torch_gprl.learners.collecting import Collection
 from torch_gprl.learners.config import PolicyGradientConfig
 from torch_gprl.learners.teaching import Teacher, make_critic
 from torch_gprl.objectives import AllActionLoss, PolicyGradientLoss, natural_step
@@ -61,6 +61,7 @@ class PolicyGradient:
             self.policy.head.log_std.requires_grad_(False)
         kind = torch.optim.Adam if config.optimiser == "adam" else torch.optim.SGD
         self.optimiser = kind(self._trained(), lr=config.learning_rate)
+        self.collection = Collection(env, self.policy, config.rollout_steps)
         self.frames_per_update = num_envs * config.rollout_steps
         self.total_updates = -(-config.total_frames // self.frames_per_update)
         self.updates = 0
@@ -85,34 +86,21 @@ class PolicyGradient:
 
     def train(self) -> Iterator[dict[str, Tensor]]:
         """Run the remaining updates; yields figures of each, [learners] every one."""
-        collector = self._collector()
-        try:
-            for rollout in collector:
-                if self.updates == 0:
-                    self._standardise(rollout)
-                seen = self._weigh(rollout)
-                # an empty critic is no baseline: the first rollout serves as its own
-                taught = self.config.in_sample or self.updates == 0
-                if taught:
-                    self.teacher.teach(rollout, self.updates)
-                    self._weigh(rollout)
-                step = self._step_policy(rollout)
-                if not taught:
-                    self.teacher.teach(rollout, self.updates)
-                self.updates += 1
-                yield self._figures(rollout, seen) | step
-        finally:
-            collector.shutdown(close_env=False)
-
-    def _collector(self) -> Collector:
-        per_update = self.learners * self.frames_per_update
-        return Collector(
-            TransformedEnv(self.env, Compose(RewardSum(), StepCounter())),  # pyright: ignore[reportCallIssue]
-            self.policy,
-            frames_per_batch=per_update,
-            total_frames=per_update * (self.total_updates - self.updates),
-            auto_register_policy_transforms=False,
-        )
+        while self.updates < self.total_updates:
+            rollout = self.collection.rollout()
+            if self.updates == 0:
+                self._standardise(rollout)
+            seen = self._weigh(rollout)
+            # an empty critic is no baseline: the first rollout serves as its own
+            taught = self.config.in_sample or self.updates == 0
+            if taught:
+                self.teacher.teach(rollout, self.updates)
+                self._weigh(rollout)
+            step = self._step_policy(rollout)
+            if not taught:
+                self.teacher.teach(rollout, self.updates)
+            self.updates += 1
+            yield self._figures(rollout, seen) | step
 
     @torch.no_grad()
     def _standardise(self, rollout: TensorDictBase) -> None:
@@ -200,7 +188,7 @@ class PolicyGradient:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """What was learned and where the random streams stand: tensors and plain numbers."""
+        """What was learned, and where environment and random streams stand: tensors and plain numbers."""
         assert self.policy.noise is not None
         return {
             "updates": self.updates,
@@ -209,6 +197,7 @@ class PolicyGradient:
             "optimiser": self.optimiser.state_dict(),
             "noise": self.policy.noise.state(),
             "last_return": self._last_return,
+            "collection": self.collection.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -218,6 +207,7 @@ class PolicyGradient:
         self.policy.load_state_dict(state["policy"])
         self.teacher.load_state_dict(state["teacher"])
         self.optimiser.load_state_dict(state["optimiser"])
+        self.collection.load_state_dict(state["collection"])
         self.policy.noise.restore(state["noise"])
         self._last_return = state["last_return"]
 

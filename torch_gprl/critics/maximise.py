@@ -193,7 +193,7 @@ class ActionMaximiser:
         return isinstance(self.critic.gp.kernel, SquaredExponential)
 
     def _maximise(self, states: Tensor, given: Tensor | None) -> Maximum:
-        values = self._candidate_values(states)
+        values = self.candidate_values(states)
         if len(self.low) == 1:
             found = self._vertex(values)
         else:
@@ -227,7 +227,7 @@ class ActionMaximiser:
         by_action = kernel(tried * ~state_columns, basis * ~state_columns)
         return Products(by_state, by_action / kernel.diag(tried).unsqueeze(-1))
 
-    def _candidate_values(self, states: Tensor) -> Float[Tensor, "*batch N J"]:
+    def candidate_values(self, states: Float[Tensor, "*batch N S"]) -> Float[Tensor, "*batch N J"]:
         """Q of all candidates at states [*batch, N, S]."""
         if self._factorises:
             mean = self.products(states).mean(self.critic.gp.alpha)

@@ -34,18 +34,12 @@ def train(updates: int = 40, copies: int = 8, steps: int = 200, epochs: int = 10
     loss = ClipPPOLoss(actor, critic_network=GPStateValue(critic, actor), critic_coeff=None)
 
     optimiser = torch.optim.Adam(actor.parameters(), lr=1e-3)
-    frames, returns = copies * steps, []
-    collector = Collector(
-        env,
-        actor,
-        frames_per_batch=frames,
-        total_frames=updates * frames,
-        auto_register_policy_transforms=False,
-    )
-    for rollout in collector:
+    returns: list[float] = []
+    frames = {"frames_per_batch": copies * steps, "total_frames": updates * copies * steps}
+    for rollout in Collector(env, actor, auto_register_policy_transforms=False, **frames):
         estimator(rollout)  # advantages by the critic as it stood before this rollout
         for _ in range(epochs):
-            for batch in rollout.reshape(-1)[torch.randperm(frames)].split(200):
+            for batch in rollout.reshape(-1)[torch.randperm(copies * steps)].split(200):
                 losses = loss(batch)
                 optimiser.zero_grad()
                 (losses["loss_objective"] + losses["loss_entropy"]).backward()

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from torch_gprl.gp.door import admit_inputs, admit_points
 from torch_gprl.gp.posterior import Posterior
@@ -44,6 +45,14 @@ class Active(NamedTuple):
     cross: Callable[[Tensor], Tensor]  # x ↦ k(X_B, x)
     gram_factor: Float[Tensor, "*batch R R"]
     mask: Bool[Tensor, "*batch R 1"] | None  # which of them are a learner's own; None if all are
+
+
+class Solved(NamedTuple):
+    """The posterior of w in the rows in use."""
+
+    precision_factor: Float[Tensor, "*batch R R"]  # Cholesky factor of A
+    weights: Float[Tensor, "*batch R"]  # A⁻¹b
+    alpha: Float[Tensor, "*batch R"]  # L⁻ᵀA⁻¹b
 
 
 class WhitenedState(nn.Module):
@@ -121,17 +130,19 @@ class WhitenedState(nn.Module):
     @property
     def alpha(self) -> Float[Tensor, "*batch B"]:
         """α = L⁻ᵀA⁻¹b: the posterior mean is k(x, X_B) α; zero where unused."""
-        self.refresh()
-        return solve_triangular(self.gram_factor.mT, self.weights.unsqueeze(-1), upper=True).squeeze(-1)
+        alpha = self._solved().alpha
+        return pad(alpha, (0, self.capacity - alpha.shape[-1]))
 
     @property
     def C(self) -> Float[Tensor, "*batch B B"]:
         """C = L⁻ᵀ(A⁻¹ − I)L⁻¹ ⪯ 0, Csató's sign: the variance is k(x, x) + k(x, X_B) C k(X_B, x)."""
-        self.refresh()
-        eye = torch.eye(self.capacity, dtype=self.basis.dtype, device=self.basis.device)
-        inverse_factor = solve_triangular(self.gram_factor, eye.expand_as(self.gram_factor))
-        half = solve_triangular(self.precision_factor, inverse_factor)
-        return half.mT @ half - inverse_factor.mT @ inverse_factor
+        factor, gram_factor = self._solved().precision_factor, self._active().gram_factor
+        rows = gram_factor.shape[-1]
+        eye = torch.eye(rows, dtype=factor.dtype, device=factor.device)
+        inverse_factor = solve_triangular(gram_factor, eye.expand_as(gram_factor))
+        half = solve_triangular(factor, inverse_factor)
+        unused = self.capacity - rows
+        return pad(half.mT @ half - inverse_factor.mT @ inverse_factor, (0, unused, 0, unused))
 
     def posterior(self, inputs: Float[Tensor, "*#batch N D"] | GaussianInputs) -> Posterior:
         """Mean and variance of f (without noise) at `inputs`, [*batch, N] each; differentiable in them.
@@ -141,18 +152,19 @@ class WhitenedState(nn.Module):
 
         For `GaussianInputs` those of the average of f over the Gaussian columns, in closed form.
         """
-        self.refresh()
+        solved = self._solved()
         inputs = admit_points(inputs, self.batch_shape, self.basis)
-        phi, half = self._project(inputs)
-        mean = (self.weights[..., None, : phi.shape[-2]] @ phi).squeeze(-2)
+        phi = self._features(inputs)
+        half = solve_triangular(solved.precision_factor, phi)
         # k** − φᵀφ + φᵀA⁻¹φ
-        return Posterior(mean, self._prior_variance(inputs) - _square(phi) + _square(half))
+        variance = self._prior_variance(inputs) - squared_columns(phi) + squared_columns(half)
+        return Posterior((phi.mT @ solved.weights.unsqueeze(-1)).squeeze(-1), variance)
 
     def mean(self, inputs: Float[Tensor, "*#batch N D"] | GaussianInputs) -> Float[Tensor, "*batch N"]:
         """Posterior mean alone [*batch, N], several times cheaper than `posterior`."""
         inputs = admit_points(inputs, self.batch_shape, self.basis)
-        alpha, active = self.alpha, self._active()
-        return (alpha[..., None, : active.rows] @ self._cross(inputs, active)).squeeze(-2)
+        cross = self._cross(inputs, self._active())
+        return (cross.mT @ self._solved().alpha.unsqueeze(-1)).squeeze(-1)
 
     def forward(
         self, inputs: Float[Tensor, "*#batch N D"]
@@ -163,11 +175,12 @@ class WhitenedState(nn.Module):
 
     def joint(self, inputs: Float[Tensor, "*#batch N D"]) -> torch.distributions.MultivariateNormal:
         """Joint posterior of f at `inputs`, for sampling whole functions."""
-        self.refresh()
+        solved = self._solved()
         inputs = admit_inputs(inputs, self.batch_shape, self.basis)
-        phi, half = self._project(inputs)
+        phi = self._features(inputs)
+        half = solve_triangular(solved.precision_factor, phi)
         covariance = self.kernel(inputs, inputs) - phi.mT @ phi + half.mT @ half
-        mean = (self.weights[..., None, : phi.shape[-2]] @ phi).squeeze(-2)
+        mean = (phi.mT @ solved.weights.unsqueeze(-1)).squeeze(-1)
         factor = cholesky(covariance)
         return torch.distributions.MultivariateNormal(mean, scale_tril=factor, validate_args=False)
 
@@ -192,18 +205,28 @@ class WhitenedState(nn.Module):
         Changes are seen by the version counters of the tensors, so weight sync and optimisers need not tell.
         A compiled caller sees the changes that went through this object's own methods.
         """
-        compiling = torch.compiler.is_compiling()
-        if not compiling and self._kernel_versions() != self._kernel_seen:
+        self._solved()
+
+    @torch.no_grad()
+    def _solved(self) -> Solved:
+        if torch.compiler.is_compiling():  # then all rows are in use, and buffers remember
+            if self._stale:
+                solved = _solve(self.gram_factor, self.precision, self.information)
+                self.precision_factor.copy_(solved.precision_factor)
+                self.weights.copy_(solved.weights)
+                self._stale = False
+            return Solved(self.precision_factor, self.weights, _coefficients(self.gram_factor, self.weights))
+        if self._kernel_versions() != self._kernel_seen:
             self.rebase()
-        if self._stale or not (compiling or self._state_versions() == self._state_seen):
-            self.precision_factor.copy_(cholesky(self.precision))
-            solution = torch.cholesky_solve(self.information.unsqueeze(-1), self.precision_factor)
-            self.weights.copy_(solution.squeeze(-1))
-            self._stale = False
-            if not compiling:
-                rows = self._active().rows
-                self._precision_factor_in_use = self.precision_factor[..., :rows, :rows].contiguous()
-                self._state_seen = self._state_versions()
+        seen = self.gram_factor._version, self.precision._version, self.information._version
+        seen = *seen, id(self.precision)
+        if self._solution is None or seen != self._solution_seen:
+            active = self._active()
+            used = slice(active.rows)
+            precision, information = self.precision[..., used, used], self.information[..., used]
+            self._solution = _solve(active.gram_factor, precision, information)
+            self._solution_seen = seen
+        return self._solution
 
     @torch.no_grad()
     def rebase(self) -> None:
@@ -224,8 +247,8 @@ class WhitenedState(nn.Module):
         # a kernel on a graph changes with the graph, which it keeps in buffers
         self._kernel_tensors = [*self.kernel.parameters(), *self.kernel.buffers()]
         self._kernel_seen = self._kernel_versions()
-        self._state_seen: tuple[int, ...] = ()
-        self._active_seen: tuple[int, ...] = ()
+        self._solution: Solved | None = None
+        self._active_rows: Active | None = None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "WhitenedState":
         super()._apply(fn, recurse)
@@ -235,14 +258,10 @@ class WhitenedState(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is derived, which a copy makes anew."""
-        derived = {"_active_rows": None, "_precision_factor_in_use": None}
-        return {**self.__dict__, **derived, "_active_seen": (), "_state_seen": ()}
+        return {**self.__dict__, "_active_rows": None, "_solution": None}
 
     def _kernel_versions(self) -> tuple[int, ...]:
         return id(self.kernel), *(tensor._version for tensor in self._kernel_tensors)
-
-    def _state_versions(self) -> tuple[int, ...]:
-        return self.precision._version, self.information._version, id(self.precision)
 
     def _active(self) -> Active:
         """The rows in use. On a GPU all rows: asking how many are used would wait for the device."""
@@ -250,18 +269,14 @@ class WhitenedState(nn.Module):
             cross = partial(self.kernel, self.basis)
             return Active(self.capacity, self.basis, cross, self.gram_factor, self.mask.unsqueeze(-1))
         seen = self.basis._version, self.gram_factor._version, id(self.basis)
-        if seen != self._active_seen:
+        if self._active_rows is None or seen != self._active_seen:
             sizes = self.size.flatten().tolist()
             rows = max(sizes, default=0)
             mask = None if min(sizes, default=0) == rows else self.mask[..., :rows].unsqueeze(-1)
             basis = self.basis[..., :rows, :].contiguous()
-            factor = self.gram_factor[..., :rows, :rows]
+            factor = self.gram_factor[..., :rows, :rows].contiguous()  # as triangular solvers want it
             self._active_rows = Active(rows, basis, self.kernel.against(basis), factor, mask)
             self._active_seen = seen
-        elif not self._active_rows.gram_factor.is_contiguous():
-            # a basis that stays is worth a copy that the solver takes as it is
-            factor = self._active_rows.gram_factor.contiguous()
-            self._active_rows = self._active_rows._replace(gram_factor=factor)
         return self._active_rows
 
     # ---------------------------------------------------------------- inside
@@ -283,13 +298,6 @@ class WhitenedState(nn.Module):
         if isinstance(inputs, GaussianInputs):
             return self.kernel.expected_pairs(inputs, inputs)
         return self.kernel.diag(inputs)
-
-    def _project(self, inputs: Tensor | GaussianInputs) -> tuple[Tensor, Tensor]:
-        """φ and R⁻¹φ with A = RRᵀ: what the basis explains of x, and what the data left open of that."""
-        phi = self._features(inputs)
-        whole = torch.compiler.is_compiling()  # then all rows are in use
-        factor = self.precision_factor if whole else self._precision_factor_in_use
-        return phi, solve_triangular(factor, phi)
 
     def _gram(self) -> Float[Tensor, "*batch B B"]:
         """K(X_B, X_B) with identity rows where unused, under the kernel's present parameters."""
@@ -334,6 +342,18 @@ def solve_triangular(factor: Tensor, right: Tensor, upper: bool = False) -> Tens
     return torch.linalg.solve_triangular(factor, right, upper=upper)
 
 
-def _square(columns: Tensor) -> Tensor:
+def squared_columns(matrix: Tensor) -> Tensor:
     """Squared norm of each column [*batch, N]."""
-    return torch.linalg.vecdot(columns, columns, dim=-2)
+    return torch.linalg.vecdot(matrix, matrix, dim=-2)
+
+
+def _solve(gram_factor: Tensor, precision: Tensor, information: Tensor) -> Solved:
+    factor = cholesky(precision)
+    half = solve_triangular(factor, information.unsqueeze(-1))
+    weights = solve_triangular(factor.mT, half, upper=True).squeeze(-1)
+    return Solved(factor, weights, _coefficients(gram_factor, weights))
+
+
+def _coefficients(gram_factor: Tensor, weights: Tensor) -> Tensor:
+    """α = L⁻ᵀ A⁻¹b."""
+    return solve_triangular(gram_factor.mT, weights.unsqueeze(-1), upper=True).squeeze(-1)

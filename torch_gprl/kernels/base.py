@@ -6,7 +6,7 @@ covariance function with positive parameters, batched over independent learners.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from functools import partial, reduce
+from functools import reduce
 from operator import add, mul
 
 import torch
@@ -49,7 +49,7 @@ class Kernel(nn.Module, ABC):
         Kernels may compute beforehand what depends on z alone. The parameters are those of now, and neither
         they nor z need get a gradient; x does.
         """
-        return partial(self, z)
+        return lambda x: self(x, z).mT
 
     @property
     def active_columns(self) -> frozenset[int]:

@@ -48,6 +48,8 @@ def log_gaussian(
 class GaussianBumps:
     """x ↦ σ² exp(−½ Σ_d (z_d − x_d)²/ℓ_d²) [*batch, M, N] for one z [*batch, M, D], prepared beforehand.
 
+    The values of one x lie side by side in memory, as triangular solvers want them.
+
     Args:
         z: points [*batch, M, D], at least one.
         log_lengthscale: log ℓ [*batch, D].
@@ -59,18 +61,18 @@ class GaussianBumps:
             self.inverse = log_lengthscale.neg().exp_().unsqueeze(-2)
             self.centre = z[..., :1, :].to(log_lengthscale.dtype)
             self.points = (z - self.centre) * self.inverse
-            square = torch.linalg.vecdot(self.points, self.points).unsqueeze(-1)
+            square = torch.linalg.vecdot(self.points, self.points).unsqueeze(-2)
             self.peak = torch.sub(log_outputscale[..., None, None], square, alpha=0.5)  # log σ² − ½|z|²/ℓ²
 
     def __call__(self, x: Inputs) -> Float[Tensor, "... M N"]:
         """Covariances with x [*batch, N, D]."""
         x = (x.to(self.peak.dtype) - self.centre) * self.inverse
-        square = torch.linalg.vecdot(x, x).unsqueeze(-2)
+        square = torch.linalg.vecdot(x, x).unsqueeze(-1)
         if x.ndim == 2 and self.points.ndim == 2:
-            exponent = torch.addmm(self.peak, self.points, x.mT)
+            exponent = torch.addmm(self.peak, x, self.points.mT)
         else:
-            exponent = self.peak + self.points @ x.mT
-        return exponent.sub_(square, alpha=0.5).exp_()
+            exponent = self.peak + x @ self.points.mT
+        return exponent.sub_(square, alpha=0.5).exp_().mT
 
 
 def _by_differences(x: Tensor, z: Tensor, log_lengthscale: Tensor, offset: Tensor | None) -> Tensor:

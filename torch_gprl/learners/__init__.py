@@ -2,5 +2,7 @@
 
 from torch_gprl.learners.config import PolicyGradientConfig
 from torch_gprl.learners.policy_gradient import PolicyGradient
+from torch_gprl.learners.q_learning import QLearning
+from torch_gprl.learners.q_learning_config import QLearningConfig
 
-__all__ = ["PolicyGradient", "PolicyGradientConfig"]
+__all__ = ["PolicyGradient", "PolicyGradientConfig", "QLearning", "QLearningConfig"]

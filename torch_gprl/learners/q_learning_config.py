@@ -1,0 +1,59 @@
+"""The numbers of Q-learning, each with its unit: they become the command line."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+Targets = Literal["fitted", "online"]
+
+LEAST = {"total_frames": 1, "rollout_steps": 1, "budget": 1, "horizon": 1, "sweeps": 1, "candidates": 3}
+POSITIVE = ("noise", "lengthscale", "action_lengthscale", "novelty_threshold")
+SHARES = ("discount", "learning_rate", "epsilon", "growth")
+
+
+@dataclass(frozen=True)
+class QLearningConfig:
+    """Q-learning with a Gaussian process for the action value."""
+
+    total_frames: int = 5_000  # environment steps per learner, over all its environments
+    rollout_steps: int = 25  # steps of each environment between two looks at the critic
+    discount: float = 0.95  # γ per environment step, from 0 to 1
+
+    targets: Targets = "fitted"  # solve all experience anew, or the thesis' update of each rollout, once
+    sweeps: int = 30  # most sweeps of value iteration in a solution; fitted
+    growth: float = 0.05  # share by which experience grows between solutions; fitted
+    learning_rate: float = 1.0  # step from the old value to the target, from 0 to 1; online
+    horizon: int = 1  # real rewards before the maximum over actions, m of (.8); online
+
+    std: float = 0.3  # of the noise round the greedy action, in halves of the actuator's range
+    epsilon: float = 0.0  # probability of an action uniform in the box
+    candidates: int = 25  # actions compared in a maximisation
+    optimism: float = 0.0  # what is not known is this many deviations of the value above its mean; fitted
+
+    budget: int = 200  # basis vectors of the critic
+    novelty_threshold: float = 0.3  # novelty that makes a point a basis vector, in noise variances
+    noise: float = 1e-3  # noise variance of targets, in their variances
+    lengthscale: float = 0.5  # of observations, in their standard deviations times √columns
+    action_lengthscale: float = 3.0  # of actions, in halves of the actuator's range
+
+    def __post_init__(self) -> None:
+        """Refuse numbers out of range.
+
+        Raises:
+            ValueError: naming the field, its value and what would be valid.
+        """
+        for name, least in LEAST.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        for name in POSITIVE:
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in SHARES:
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must lie between 0 and 1, got {getattr(self, name)}")
+        if not 0 <= self.std < math.inf:
+            raise ValueError(f"std must be at least 0, got {self.std}")
+        if not math.isfinite(self.optimism):
+            raise ValueError(f"optimism must be finite, got {self.optimism}")
+        if self.targets not in get_args(Targets):
+            raise ValueError(f"targets must be one of {', '.join(get_args(Targets))}, got {self.targets!r}")

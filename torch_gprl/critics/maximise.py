@@ -138,7 +138,7 @@ class ActionMaximiser:
         high: upper bounds, [A].
         candidates: actions compared for every state, see `candidate_actions`.
         starts: how many of the best candidates are improved by gradient steps; more than one dimension.
-        steps: gradient steps of each; more than one dimension.
+        steps: gradient steps of each; 0 takes the best candidate as it is, in one dimension too.
     """
 
     def __init__(
@@ -194,7 +194,10 @@ class ActionMaximiser:
 
     def _maximise(self, states: Tensor, given: Tensor | None) -> Maximum:
         values = self.candidate_values(states)
-        if len(self.low) == 1:
+        if not self.steps:
+            best, index = values.max(-1)
+            found = Maximum(self.candidates[index], best)
+        elif len(self.low) == 1:
             found = self._vertex(values)
         else:
             found = self._climb(states, values, given)

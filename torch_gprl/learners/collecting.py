@@ -43,10 +43,8 @@ class Collection:
 
     def _start(self) -> Collector:
         """Reset the environment, and try the policy once, as TorchRL does to learn its keys."""
-        transforms = Compose(FiniteExperience(), RewardSum(), StepCounter())  # pyright: ignore[reportCallIssue]
-        env = TransformedEnv(self.env, transforms, auto_unwrap=True)
         self._collector = Collector(
-            env,
+            watched(self.env),
             self.policy,
             frames_per_batch=self.steps * self.env.batch_size.numel(),
             total_frames=-1,
@@ -83,6 +81,12 @@ def _simulation(env: EnvBase) -> EnvBase:
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env
+
+
+def watched(env: EnvBase) -> TransformedEnv:
+    """The environment with what learners read beside it, and with a check of all that it gives."""
+    transforms = Compose(FiniteExperience(), RewardSum(), StepCounter())  # pyright: ignore[reportCallIssue]
+    return TransformedEnv(env, transforms, auto_unwrap=True)
 
 
 class FiniteExperience(Transform):

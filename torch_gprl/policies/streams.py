@@ -1,5 +1,6 @@
 """Random numbers by learner: what learner i draws does not depend on how many others learn beside it."""
 
+import copy
 from collections.abc import Sequence
 from typing import Literal
 
@@ -51,6 +52,15 @@ class NoiseStream:
         noise = self._block[:, self._next]
         self._next += 1
         return noise.to(like)  # a restored block comes from the CPU
+
+    def split(self, count: int) -> list["NoiseStream"]:
+        """Streams for `count` copies of a policy, seeded from this one, which moves on."""
+        parts = [copy.copy(self) for _ in range(count)]
+        for part in parts:
+            seeds = [torch.randint(2**62, (), generator=generator) for generator in self._generators]
+            part._generators = [torch.Generator().manual_seed(int(seed)) for seed in seeds]
+            part._block = None
+        return parts
 
     def state(self) -> dict[str, Tensor]:
         """Tensors that `restore` takes."""

@@ -1,0 +1,226 @@
+"""Experience from several processes: TorchRL's multi-process collectors, fed with policy and critic.
+
+    with contextlib.closing(WorkerCollection(factories, learner.policy, steps, learner.critic)) as workers:
+        learner.collection = workers
+        for figures in learner.train(): ...
+
+TorchRL's weight sync carries a policy's own tensors. Here the critic travels too, since exploration may ask
+it for its variance, and it arrives through `load_state_dict`, by which a Gaussian process learns that it has
+changed. Both stand in memory that all processes map, between two counters: the learner raises the first,
+writes, then raises the second; a worker that finds them different has read half of a change, and keeps what
+it has.
+"""
+
+import copy
+import functools
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.envs import EnvBase
+from torchrl.weight_update import NoWeightSyncScheme
+
+from torch_gprl.learners.collecting import watched
+from torch_gprl.policies.streams import NoiseStream
+
+
+class WorkerCollection:
+    """Rollouts [learners, envs, T] collected by several processes on one machine; see `Collection`.
+
+    Synchronous workers share a rollout's environments, and all of it is made by the policy of the moment.
+    Asynchronous ones make whole rollouts in turn while the learner learns: a rollout may have been begun
+    under an older policy. Workers take up a new policy between two steps.
+
+    Their environments are not saved, a resumed run begins new episodes. Every worker has random numbers of
+    its own, drawn from the policy's streams: a run repeats itself if it is synchronous and keeps its number
+    of workers. Scripts that use workers need the guard `if __name__ == "__main__"`.
+
+    Args:
+        factories: one for each worker, makes its environment of batch [learners, envs of this worker].
+        policy: reads `observation`, writes `action`.
+        steps: T, steps of each environment in a rollout.
+        critic: what the policy explores by, if it does.
+        asynchronous: workers do not wait for the learner.
+
+    Raises:
+        ValueError: no factory.
+    """
+
+    def __init__(
+        self,
+        factories: Sequence[Callable[[], EnvBase]],
+        policy: TensorDictModuleBase,
+        steps: int,
+        critic: nn.Module | None = None,
+        asynchronous: bool = False,
+    ) -> None:
+        if not factories:
+            raise ValueError("workers need environments: give one factory for each worker, got none")
+        self.factories, self.steps, self.asynchronous = list(factories), steps, asynchronous
+        modules = {"policy": policy} if critic is None else {"policy": policy, "critic": critic}
+        self._followed = nn.ModuleDict(modules)
+        self._folder = tempfile.TemporaryDirectory(prefix="torch-gprl-")
+        self._board = Board(Path(self._folder.name) / "board")
+        self._collector: MultiSyncCollector | MultiAsyncCollector | None = None
+
+    def rollout(self) -> TensorDictBase:
+        """The next T steps, after the workers have been told of today's policy.
+
+        Raises:
+            RuntimeError: a worker failed; the message tells why. The learner's state is unharmed.
+        """
+        self._board.post(self._followed)
+        if self._collector is None:
+            self._start()
+        try:
+            return next(self._rollouts)
+        except RuntimeError as error:
+            raise RuntimeError(
+                f"a worker failed: {self._cause() or error}. What was learned until now is unharmed: "
+                "save it, or go on from the last checkpoint"
+            ) from error
+
+    def _start(self) -> None:
+        folder = Path(self._folder.name)
+        modules = list(copied_for_workers(self._followed, len(self.factories)))
+        sample = self.factories[0]()
+        frames = self.steps * sample.batch_size.numel()
+        sample.close()
+        options: dict[str, Any] = {"frames_per_batch": frames}
+        kind: type[MultiSyncCollector | MultiAsyncCollector] = MultiAsyncCollector
+        if not self.asynchronous:
+            kind = MultiSyncCollector
+            options = {
+                "frames_per_batch": frames * len(modules),
+                "cat_results": 1,
+            }  # environments side by side
+        self._collector = kind(
+            [functools.partial(_made, factory) for factory in self.factories],
+            policy_factory=[functools.partial(FollowingPolicy, part, self._board.folder) for part in modules],
+            total_frames=-1,
+            weight_sync_schemes={"policy": NoWeightSyncScheme()},
+            auto_register_policy_transforms=False,
+            collector_class=functools.partial(ReportingCollector, reports=folder, track_traj_ids=False),
+            use_buffers=True,
+            **options,
+        )
+        self._rollouts = iter(self._collector)
+
+    def _cause(self) -> str:
+        """What failed workers have left word of."""
+        reports = sorted(Path(self._folder.name).glob("worker-*.txt"))
+        return "; ".join(f"{path.stem}: {path.read_text(encoding='utf-8')}" for path in reports)
+
+    def close(self) -> None:
+        """End the workers."""
+        if self._collector is not None:
+            self._collector.shutdown(raise_on_error=False)
+        self._folder.cleanup()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: the workers' simulations are theirs."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Begin new episodes, whatever collection the state came from."""
+
+
+class Board:
+    """Tensors of modules where other processes can read them, in files that all of them map into memory.
+
+    Args:
+        folder: of the files; made by the first `post`.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._posted: TensorDict | None = None
+
+    def post(self, modules: nn.Module) -> None:
+        """Write all tensors of `modules`, between the two counters."""
+        state = modules.state_dict()
+        if self._posted is None:
+            counters = {"head": torch.zeros((), dtype=torch.long), "tail": torch.zeros((), dtype=torch.long)}
+            content = TensorDict({**counters, "state": TensorDict({k: v.cpu() for k, v in state.items()})})
+            self._posted = content.memmap(str(self.folder))
+        posted = self._posted
+        posted["head"].add_(1)
+        for name, tensor in state.items():
+            posted["state", name].copy_(tensor)
+        posted["tail"].copy_(posted["head"])
+
+    def read(self, seen: int) -> tuple[int, dict[str, Tensor]] | None:
+        """Version and tensors, if there is a whole version other than `seen`."""
+        if self._posted is None:
+            self._posted = TensorDict.load_memmap(self.folder)
+        version = int(self._posted["tail"])
+        if version == seen:
+            return None
+        state = self._posted.get("state").clone().to_dict()
+        return (version, state) if int(self._posted["head"]) == version else None
+
+
+class FollowingPolicy(TensorDictModuleBase):
+    """A worker's copy of the policy, which takes up what the learner has posted before it acts.
+
+    Args:
+        modules: copies of "policy" and, if it is followed, of "critic".
+        folder: of the board.
+    """
+
+    def __init__(self, modules: nn.ModuleDict, folder: Path) -> None:
+        super().__init__()
+        policy = modules["policy"]
+        assert isinstance(policy, TensorDictModuleBase)
+        self.in_keys = list(policy.in_keys)  # pyright: ignore[reportAttributeAccessIssue]
+        self.out_keys = list(policy.out_keys)  # pyright: ignore[reportAttributeAccessIssue]
+        self.modules_followed, self.policy = modules, policy
+        self.board, self.version = Board(folder), 0
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Act as the learner's policy would."""
+        news = self.board.read(self.version)
+        if news is not None:
+            self.version, state = news
+            self.modules_followed.load_state_dict(state)
+        return self.policy(tensordict)
+
+
+class ReportingCollector(Collector):
+    """A worker's collector, which leaves the cause in a file when it fails; TorchRL leaves it on the screen."""
+
+    def __init__(self, *args: Any, reports: Path, worker_idx: int | None = None, **options: Any) -> None:  # noqa: ANN401
+        self.report = reports / f"worker-{worker_idx}.txt"
+        super().__init__(*args, worker_idx=worker_idx, **options)
+
+    def iterator(self) -> Any:  # noqa: ANN401  (TorchRL's iterator of rollouts)
+        """TorchRL's rollouts."""
+        try:
+            yield from super().iterator()
+        except Exception as error:
+            self.report.write_text(f"{type(error).__name__}: {error}", encoding="utf-8")
+            raise
+
+
+def copied_for_workers(modules: nn.ModuleDict, count: int) -> list[nn.ModuleDict]:
+    """Copies of policy and critic that see each other as the originals do, with noise of their own."""
+    copies = [copy.deepcopy(modules) for _ in range(count)]
+    for originals in zip(modules.modules(), *(one.modules() for one in copies), strict=True):
+        noise = getattr(originals[0], "noise", None)
+        if isinstance(noise, NoiseStream):
+            for module, own in zip(originals[1:], noise.split(count), strict=True):
+                module.noise = own
+    return copies
+
+
+def _made(factory: Callable[[], EnvBase]) -> EnvBase:
+    """A worker's environment, watched as `Collection` watches its own."""
+    torch.set_num_threads(1)
+    return watched(factory())

@@ -9,6 +9,7 @@ from torch_gprl.policies.controllers import (
     ScaledController,
 )
 from torch_gprl.policies.gaussian import GaussianPolicy, NormalPolicy, gaussian_policy
+from torch_gprl.policies.gibbs import GibbsConfig, GibbsPolicy
 from torch_gprl.policies.streams import NoiseStream
 
 __all__ = [
@@ -16,6 +17,8 @@ __all__ = [
     "ConfidenceScale",
     "Controller",
     "GaussianPolicy",
+    "GibbsConfig",
+    "GibbsPolicy",
     "Greedy",
     "LinearController",
     "MLPController",

@@ -11,6 +11,7 @@ import envs
 from torch_gprl.critics import EstimatorName
 from torch_gprl.gp import AgeAwareScore
 from torch_gprl.learners import PolicyGradient, PolicyGradientConfig
+from torch_gprl.learners.config import BY_STATE_VALUES, Optimiser
 
 ENVS, STEPS = 4, 25
 
@@ -37,9 +38,19 @@ def test_every_estimator_moves_every_parameter(name, targets):
     assert all(not torch.equal(before[key], new) for key, new in made.policy.named_parameters())
 
 
-@pytest.mark.parametrize("optimiser", ["natural", "adam", "plain"])
+@pytest.mark.parametrize("name", BY_STATE_VALUES)
+def test_every_estimator_by_state_values_serves_a_neural_critic(name):
+    made = learner(2, estimator=name, critic="neural")
+    before = {key: parameter.clone() for key, parameter in made.policy.named_parameters()}
+    for figures in made.train():
+        assert (figures["gradient_norm"] > 0).all()
+        assert "basis_size" not in figures
+    assert all(not torch.equal(before[key], new) for key, new in made.policy.named_parameters())
+
+
+@pytest.mark.parametrize("optimiser", get_args(Optimiser))
 def test_every_optimiser_moves_the_policy(optimiser):
-    made = learner(2, optimiser=optimiser)
+    made = learner(2, optimiser=optimiser, estimator="return")
     before = [parameter.clone() for parameter in made.policy.parameters()]
     list(made.train())
     assert all(not torch.equal(old, new) for old, new in zip(before, made.policy.parameters(), strict=True))
@@ -104,9 +115,14 @@ def test_age_makes_the_critic_forget_its_oldest_basis_vectors():
     assert (oldest[1.0] > 8).any()
 
 
-@pytest.mark.parametrize("replay", [0, 150])
-def test_a_saved_run_goes_on_as_it_would_have(replay):
-    numbers = {"updates": 4, "targets": "differences", "estimator": "all-action", "replay": replay}
+DIFFERENCES = {"targets": "differences", "estimator": "all-action"}
+
+
+@pytest.mark.parametrize(
+    "numbers", [DIFFERENCES, DIFFERENCES | {"replay": 150}, {"critic": "neural"}], ids=str
+)
+def test_a_saved_run_goes_on_as_it_would_have(numbers):
+    numbers = {"updates": 4, **numbers}
     made, other = learner(**numbers), learner(**numbers)
     training = made.train()
     list(itertools.islice(training, 2))

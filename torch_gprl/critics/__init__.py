@@ -5,11 +5,12 @@ from torch_gprl.critics.calibration import correlation, interval_coverage
 from torch_gprl.critics.estimators import ESTIMATORS, USE_ALL_ACTIONS, EstimatorName, Evaluation
 from torch_gprl.critics.gaussian_actions import action_moments, clipped_moments
 from torch_gprl.critics.returns import k_step_returns
-from torch_gprl.critics.value_estimator import GPStateValue, GPValueEstimator
+from torch_gprl.critics.value_estimator import Critic, GPStateValue, GPValueEstimator
 
 __all__ = [
     "ESTIMATORS",
     "USE_ALL_ACTIONS",
+    "Critic",
     "EstimatorName",
     "Evaluation",
     "GPActionValue",

@@ -11,7 +11,7 @@ It writes the weights of the scores, by any of the names in `estimators`, and th
 # pyright: reportIncompatibleVariableOverride=false
 
 from dataclasses import dataclass
-from typing import get_args
+from typing import Protocol, get_args, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
@@ -20,9 +20,23 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torch_gprl.critics.action_value import GPActionValue
 from torch_gprl.critics.estimators import ESTIMATORS, EstimatorName, Evaluation
 from torch_gprl.critics.gaussian_actions import action_moments
+
+
+@runtime_checkable
+class Critic(Protocol):
+    """What the estimator asks of a critic: `GPActionValue` has it, and so may others."""
+
+    in_keys: list
+
+    def mean_value(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Q(s, a) in units of the return [*batch, ...]."""
+        ...
+
+    def mean_state_value(self, observation: Tensor, loc: Tensor, scale: Tensor) -> Tensor:
+        """V(s), for actions N(loc, scale²), in units of the return [*batch, ...]."""
+        ...
 
 
 class GPStateValue(TensorDictModuleBase):
@@ -33,10 +47,10 @@ class GPStateValue(TensorDictModuleBase):
         policy: Gaussian policy over whose actions to average; not trained by this module.
     """
 
-    critic: GPActionValue
+    critic: Critic
     policy: ProbabilisticTensorDictSequential
 
-    def __init__(self, critic: GPActionValue, policy: ProbabilisticTensorDictSequential) -> None:
+    def __init__(self, critic: Critic, policy: ProbabilisticTensorDictSequential) -> None:
         super().__init__()
         self.in_keys, self.out_keys = [str(critic.in_keys[0])], ["state_value"]
         _refer(self, critic=critic, policy=policy)
@@ -82,12 +96,12 @@ class GPValueEstimator(ValueEstimatorBase):
         sample_log_prob: NestedKey | None = None
 
     default_keys = _AcceptedKeys
-    critic: GPActionValue
+    critic: Critic
     policy: ProbabilisticTensorDictSequential
 
     def __init__(
         self,
-        critic: GPActionValue,
+        critic: Critic,
         policy: ProbabilisticTensorDictSequential,
         discount: float,
         estimator: EstimatorName = "k-step-baseline",
@@ -159,7 +173,7 @@ class GPValueEstimator(ValueEstimatorBase):
         )
 
 
-def _refer(module: TensorDictModuleBase, **others: TensorDictModuleBase) -> None:
+def _refer(module: TensorDictModuleBase, **others: Critic | TensorDictModuleBase) -> None:
     """Know other modules without owning them: the learner saves the critic, the loss trains the policy."""
     for name, other in others.items():
         object.__setattr__(module, name, other)

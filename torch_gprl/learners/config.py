@@ -7,12 +7,14 @@ from typing import Literal, get_args
 from torch_gprl.critics import EstimatorName
 
 ControllerForm = Literal["linear", "rbf", "mlp"]
-Optimiser = Literal["natural", "adam", "plain"]
+CriticForm = Literal["gp", "neural"]
+Optimiser = Literal["natural", "episodic-natural", "adam", "plain"]
 Exploration = Literal["learned", "fixed", "scheduled"]
 Targets = Literal["returns", "differences"]
 AgeForm = Literal["exponential", "logit"]
 
 CHOICES = {
+    "critic": CriticForm,
     "estimator": EstimatorName,
     "controller": ControllerForm,
     "optimiser": Optimiser,
@@ -20,6 +22,16 @@ CHOICES = {
     "targets": Targets,
     "age_form": AgeForm,
 }
+# What a critic of states alone can weigh actions by.
+BY_STATE_VALUES = (
+    "return",
+    "reward-to-go",
+    "mean-baseline",
+    "optimal-baseline",
+    "value-baseline",
+    "k-step-baseline",
+    "generalised",
+)
 LEAST = {"total_frames": 1, "rollout_steps": 1, "budget": 1, "renew_every": 1, "horizon": 0, "replay": 0}
 POSITIVE = (
     "std",
@@ -43,6 +55,7 @@ class PolicyGradientConfig:
     discount: float = 0.98  # γ per environment step, from 0 to 1
     discount_states: bool = False  # weigh step t of an episode by γ^t, the gradient of the discounted return
 
+    critic: CriticForm = "gp"  # Q(s, a) by a Gaussian process, or V(s) by a neural network
     estimator: EstimatorName = "generalised"  # how good an action was; torch_gprl.critics.estimators
     horizon: int = 200  # real rewards before the critic's value takes over, in the k-step estimators
     trace: float = 0.9  # λ of the estimator "generalised", from 0 to 1
@@ -51,7 +64,7 @@ class PolicyGradientConfig:
     std: float = 0.5  # initial exploration standard deviation, in halves of the actuator's range
     exploration: Exploration = "learned"  # of the standard deviation; scheduled goes in equal steps
     final_std: float = 0.1  # where the scheduled standard deviation ends, in halves of the actuator's range
-    optimiser: Optimiser = "natural"  # natural gradient in a trust region, Adam, or the plain gradient
+    optimiser: Optimiser = "natural"  # natural gradient, the same by regression on episodes, Adam, or plain
     trust_region: float = 0.05  # KL divergence of the first natural step, nats; falls linearly to 0
     learning_rate: float = 0.01  # of Adam and of the plain gradient; falls linearly to 0
 
@@ -87,5 +100,20 @@ class PolicyGradientConfig:
             if getattr(self, name) not in get_args(kind):
                 choices = ", ".join(get_args(kind))
                 raise ValueError(f"{name} must be one of {choices}, got {getattr(self, name)!r}")
+        self._check_combinations()
+
+    def _check_combinations(self) -> None:
         if self.replay and self.targets != "differences":
             raise ValueError("replay solves temporal differences anew and needs targets 'differences'")
+        if self.critic == "neural" and self.estimator not in BY_STATE_VALUES:
+            choices = ", ".join(BY_STATE_VALUES)
+            raise ValueError(
+                f"critic 'neural' knows no action values; choose one of {choices}, got {self.estimator!r}"
+            )
+        if self.critic == "neural" and self.estimator == "k-step-baseline" and self.horizon == 0:
+            raise ValueError("critic 'neural' needs at least one real reward: horizon 1 or more, got 0")
+        if self.optimiser == "episodic-natural" and self.estimator != "return":
+            raise ValueError(
+                "optimiser 'episodic-natural' regresses returns of episodes and needs estimator 'return', "
+                f"got {self.estimator!r}"
+            )

@@ -1,5 +1,8 @@
 """Policy gradients with a Gaussian-process critic: the thesis' Claims 1 and 2 as a loop.
 
+The baselines of the field are options of the same loop: REINFORCE, a neural state value with generalised
+advantages, and the episodic natural actor-critic.
+
 One update: collect a rollout, weigh its actions with the critic as it stood before, step the policy, teach
 the critic. All learners at once, each on its own experience.
 """
@@ -9,22 +12,32 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torch_gprl.critics import USE_ALL_ACTIONS, Evaluation, GPValueEstimator
+from torch_gprl.critics import USE_ALL_ACTIONS, Evaluation, GPActionValue, GPValueEstimator
 from torch_gprl.learners.collecting import Collection
 from torch_gprl.learners.config import PolicyGradientConfig
+from torch_gprl.learners.neural_value import NeuralTeacher, NeuralValue
 from torch_gprl.learners.teaching import Teacher, make_critic
-from torch_gprl.objectives import AllActionLoss, PolicyGradientLoss, natural_step
+from torch_gprl.objectives import (
+    AllActionLoss,
+    PolicyGradientLoss,
+    compatible_weights,
+    episode_scores,
+    natural_step,
+    split_episodes,
+    step_along,
+)
 from torch_gprl.policies import Controller, LinearController, MLPController, RBFController, gaussian_policy
 
 FISHER_EVERY = 4  # one step in four of a rollout enters the Fisher matrix
 
 
 class PolicyGradient:
-    """Trains Gaussian policies, one for each learner of `env`, with a Gaussian process for the action value.
+    """Trains Gaussian policies, one for each learner of `env`, with a critic for each.
 
     Args:
         env: environment of batch [learners, environments] with a bounded action.
@@ -51,8 +64,8 @@ class PolicyGradient:
         self.policy = gaussian_policy(controller, env.action_spec, config.std, seed, learners=indices).to(
             env.device
         )
-        self.critic = make_critic(self.policy, config, self.learners).to(env.device)
-        self.teacher = Teacher(self.critic, self.policy, config)
+        self.teacher = self._teacher(seed, first_learner)
+        self.critic = self.teacher.critic
         self.value_estimator = GPValueEstimator(
             self.critic, self.policy, config.discount, config.estimator, config.horizon, config.trace
         )
@@ -67,12 +80,20 @@ class PolicyGradient:
         self.updates = 0
         self._last_return = torch.full((self.learners,), torch.nan, device=env.device)
 
+    def _teacher(self, seed: int, first_learner: int) -> Teacher | NeuralTeacher:
+        """An empty critic, with what teaches it."""
+        if self.config.critic == "gp":
+            critic = make_critic(self.policy, self.config, self.learners).to(self.env.device)
+            return Teacher(critic, self.policy, self.config)
+        dims = self.policy.head.controller.observation_dim
+        return NeuralTeacher(NeuralValue(dims, self.learners, seed, first_learner).to(self.env.device))
+
     def _losses(self) -> list[PolicyGradientLoss | AllActionLoss]:
         """The terms of the objective: sampled scores, all actions in closed form, or both."""
         losses: list[PolicyGradientLoss | AllActionLoss] = []
         if self.config.estimator != "all-action":
             losses.append(PolicyGradientLoss(self.policy))
-        if self.config.estimator in USE_ALL_ACTIONS:
+        if self.config.estimator in USE_ALL_ACTIONS and isinstance(self.critic, GPActionValue):
             losses.append(AllActionLoss(self.policy, self.critic))
         return losses
 
@@ -126,6 +147,9 @@ class PolicyGradient:
         figures = self._differentiate(rollout, parameters)
         if self.config.optimiser == "natural":
             natural_step(parameters, self._divergence(rollout), self.config.trust_region * left)
+        elif self.config.optimiser == "episodic-natural":
+            direction = self._regress_on_episodes(rollout, parameters)
+            step_along(direction, parameters, self._divergence(rollout), self.config.trust_region * left)
         else:
             self.optimiser.param_groups[0]["lr"] = self.config.learning_rate * left
             self.optimiser.step()
@@ -153,6 +177,17 @@ class PolicyGradient:
         cosine = torch.cosine_similarity(one, other, dim=1) if len(gradients) == 2 else one[:, 0] * torch.nan
         return {"gradient_norm": _gradient(parameters).norm(dim=1), "gradient_cosine": cosine}
 
+    def _regress_on_episodes(
+        self, rollout: TensorDictBase, parameters: list[torch.nn.Parameter]
+    ) -> Float[Tensor, "learners P"]:
+        """The natural gradient as the episodic natural actor-critic finds it."""
+        discount = self.config.discount if self.config.discount_states else 1.0
+        episodes = split_episodes(rollout.get(("next", "done")).squeeze(-1), discount)
+        distribution = self.policy.get_dist(rollout.select(*self.policy.in_keys))
+        scores = episode_scores(distribution.log_prob(rollout.get("action")), parameters, episodes)
+        returns = episodes.sums(rollout.get(("next", "reward")).squeeze(-1))
+        return compatible_weights(scores, returns, episodes.used).to(parameters[0].dtype)
+
     def _divergence(self, rollout: TensorDictBase) -> Callable[[], Tensor]:
         """Mean KL(π_now ‖ π_θ) over states of the rollout [learners], a function of the parameters θ."""
         observation = rollout.get("observation")[:, :, ::FISHER_EVERY]
@@ -178,11 +213,9 @@ class PolicyGradient:
         )  # no episode ended: the last known
         error = (seen.to_go - seen.taken).flatten(1)
         surprise = (seen.to_go - seen.value).flatten(1)
-        return {
+        return self.teacher.figures() | {
             "return": self._last_return,
             "sigma": self.policy.std.mean(-1),
-            "basis_size": self.critic.gp.size.clone(),
-            "outdated": self.teacher.outdated(),
             "value_error": error.square().mean(1).sqrt(),
             "explained_variance": 1 - surprise.var(1) / seen.to_go.flatten(1).var(1),
         }

@@ -105,10 +105,11 @@ class Teacher:
         assert isinstance(stored, TensorDictBase)
         return stored.transpose(0, 1)
 
-    def outdated(self) -> Tensor:
-        """Share of basis vectors older than the newest experience [learners]."""
+    def figures(self) -> dict[str, Tensor]:
+        """Basis vectors in use, and the share of them that is older than the newest experience [learners]."""
         gp = self.critic.gp
-        return ((gp.stamps < gp.clock) & gp.mask).sum(-1) / gp.size.clamp_min(1)
+        outdated = ((gp.stamps < gp.clock) & gp.mask).sum(-1) / gp.size.clamp_min(1)
+        return {"basis_size": gp.size.clone(), "outdated": outdated}
 
     def state_dict(self) -> dict[str, Any]:
         """Critic and replay."""

@@ -32,21 +32,56 @@ def natural_step(
         the norm of each learner's gradient [learners].
     """
     gradient = _flatten([p.grad if p.grad is not None else torch.zeros_like(p) for p in parameters])
+    fisher = _fisher_products(parameters, divergence)
+    curvature = (gradient * fisher(gradient)).sum(-1, keepdim=True)
+    relative = damping * curvature / gradient.square().sum(-1, keepdim=True).clamp_min(1e-30)
+    direction = conjugate_gradients(lambda v: fisher(v) + relative * v, gradient, iterations)
+    _move(parameters, -direction, fisher, max_divergence)
+    return gradient.norm(dim=-1)
+
+
+def step_along(
+    direction: Float[Tensor, "learners P"],
+    parameters: Sequence[nn.Parameter],
+    divergence: Callable[[], Float[Tensor, " learners"]],
+    max_divergence: float,
+) -> None:
+    """Move `parameters` along a direction as far as `max_divergence`; see `natural_step` for the others.
+
+    Args:
+        direction: of ascent, the parameters flattened and in their order; a learner whose direction is zero
+            stays where it is.
+        parameters: as `natural_step`.
+        divergence: as `natural_step`.
+        max_divergence: as `natural_step`.
+    """
+    _move(parameters, direction, _fisher_products(parameters, divergence), max_divergence)
+
+
+def _fisher_products(
+    parameters: Sequence[nn.Parameter], divergence: Callable[[], Tensor]
+) -> Callable[[Tensor], Tensor]:
+    """Products of each learner's Fisher matrix with a vector [learners, P]."""
     slope = torch.autograd.grad(divergence().sum(), parameters, create_graph=True)
 
     def fisher(vector: Tensor) -> Tensor:
         product = torch.autograd.grad(slope, parameters, _unflatten(vector, parameters), retain_graph=True)
         return _flatten(product)
 
-    curvature = (gradient * fisher(gradient)).sum(-1, keepdim=True)
-    relative = damping * curvature / gradient.square().sum(-1, keepdim=True).clamp_min(1e-30)
-    direction = conjugate_gradients(lambda v: fisher(v) + relative * v, gradient, iterations)
+    return fisher
+
+
+@torch.no_grad()
+def _move(
+    parameters: Sequence[nn.Parameter],
+    direction: Tensor,
+    fisher: Callable[[Tensor], Tensor],
+    max_divergence: float,
+) -> None:
     quadratic = (direction * fisher(direction)).sum(-1, keepdim=True)
     size = (2 * max_divergence / quadratic.clamp_min(1e-30)).sqrt()
-    with torch.no_grad():
-        for parameter, step in zip(parameters, _unflatten(size * direction, parameters), strict=True):
-            parameter.sub_(step)
-    return gradient.norm(dim=-1)
+    for parameter, step in zip(parameters, _unflatten(size * direction, parameters), strict=True):
+        parameter.add_(step)
 
 
 def conjugate_gradients(

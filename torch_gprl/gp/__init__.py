@@ -5,6 +5,7 @@ from torch_gprl.gp.exact import ExactGP
 from torch_gprl.gp.posterior import Posterior
 from torch_gprl.gp.pruning import AgeAwareScore, BasisStatistics, InformationScore, PruningScore
 from torch_gprl.gp.recursion import RecursiveGP
+from torch_gprl.gp.sample_paths import Paths, PathSampler
 from torch_gprl.gp.sparse_online import SparseOnlineGP
 
 __all__ = [
@@ -12,6 +13,8 @@ __all__ = [
     "BasisStatistics",
     "ExactGP",
     "InformationScore",
+    "PathSampler",
+    "Paths",
     "Posterior",
     "PruningScore",
     "RecursiveGP",

@@ -10,6 +10,7 @@ from torch_gprl.policies.controllers import (
 )
 from torch_gprl.policies.gaussian import GaussianPolicy, NormalPolicy, gaussian_policy
 from torch_gprl.policies.gibbs import GibbsConfig, GibbsPolicy
+from torch_gprl.policies.optimistic import ThompsonSampling, UpperConfidence
 from torch_gprl.policies.streams import NoiseStream
 
 __all__ = [
@@ -26,6 +27,8 @@ __all__ = [
     "NormalPolicy",
     "RBFController",
     "ScaledController",
+    "ThompsonSampling",
+    "UpperConfidence",
     "action_box",
     "gaussian_policy",
 ]

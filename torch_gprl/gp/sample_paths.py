@@ -1,0 +1,104 @@
+"""Whole functions drawn from the posterior of a sparse GP: pathwise conditioning.
+
+Wilson et al. (2020), "Efficiently sampling functions from Gaussian process posteriors": a function g of the
+prior, made of random Fourier features, and what the basis says against it,
+
+    f(x) = g(x) + φ(x)ᵀ (w − L⁻¹ g(X_B)),   w = A⁻¹b + R⁻ᵀε,   A = R Rᵀ,   ε ~ N(0, I).
+
+With φ = L⁻¹k and w in the whitened coordinates of `whitened`, the second term has the posterior's law at the
+basis, and the first carries what the basis misses of x: far from all data f is the prior again. A path is one
+function for all inputs, unlike a draw of the joint posterior, which is one for the inputs it was drawn at.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torch_gprl.gp.sparse_online import SparseOnlineGP
+from torch_gprl.gp.whitened import solve_triangular
+from torch_gprl.kernels import Matern, SquaredExponential
+
+
+class Paths(NamedTuple):
+    """E functions of each learner, by their coefficients; they hold until the GP learns."""
+
+    features: Float[Tensor, "*batch E F2"]
+    basis: Float[Tensor, "*batch E B"]
+
+
+class PathSampler:
+    """Draws functions from a GP's posterior as it stands, from given normal numbers.
+
+    The same numbers give the same random function, seen in the light of more data once the GP has learned.
+
+    Args:
+        gp: the process; its kernel is a squared exponential or a Matérn.
+        features: random frequencies; the prior's covariance is off by about one over their root.
+        generators: of the frequencies, one for each entry of the flattened batch shape.
+
+    Raises:
+        TypeError: another kernel, whose spectrum is not known here.
+    """
+
+    def __init__(self, gp: SparseOnlineGP, features: int, generators: Sequence[torch.Generator]) -> None:
+        if not isinstance(gp.kernel, SquaredExponential | Matern):
+            raise TypeError(
+                f"sample paths need a SquaredExponential or a Matern kernel, got {type(gp.kernel).__name__}; "
+                "gp.joint(inputs) draws values at given inputs for any kernel"
+            )
+        self.gp = gp
+        dims = gp.kernel.input_dim
+        drawn = [_unit_frequencies(gp.kernel, features, dims, generator) for generator in generators]
+        self.frequencies = torch.stack(drawn).reshape(*gp.batch_shape, features, dims).to(gp.basis)
+
+    @property
+    def random_numbers(self) -> int:
+        """Standard normal numbers that a function takes."""
+        return 2 * self.frequencies.shape[-2] + self.gp.capacity
+
+    @torch.no_grad()
+    def draw(self, normal: Float[Tensor, "*batch E R"]) -> Paths:
+        """E functions for each learner, from as many normal numbers each as `random_numbers` says."""
+        solved, active = self.gp._solved(), self.gp._active()
+        features, ε = normal.to(active.basis).tensor_split((2 * self.frequencies.shape[-2],), -1)
+        ε = ε[..., : active.rows].mT
+        w = solved.weights.unsqueeze(-1) + solve_triangular(solved.precision_factor.mT, ε, upper=True)
+        at_basis = self._features(active.basis) @ features.mT
+        mask = 1.0 if active.mask is None else active.mask
+        against = w - solve_triangular(active.gram_factor, at_basis * mask)
+        basis = solve_triangular(active.gram_factor.mT, against * mask, upper=True)
+        return Paths(features, basis.mT)
+
+    def values(self, paths: Paths, inputs: Float[Tensor, "*batch E P D"]) -> Float[Tensor, "*batch E P"]:
+        """Each function at P inputs of its own, differentiable in them."""
+        flat, points = inputs.flatten(-3, -2), inputs.shape[-3:-1]
+        prior = self._features(flat).unflatten(-2, points)
+        cross = self.gp._active().cross(flat).mT.unflatten(-2, points)
+        return (prior @ paths.features.unsqueeze(-1) + cross @ paths.basis.unsqueeze(-1)).squeeze(-1)
+
+    def _features(self, inputs: Float[Tensor, "*batch N D"]) -> Float[Tensor, "*batch N F2"]:
+        """Features whose products average to the kernel: √(σ²/F) (cos ωᵀx, sin ωᵀx)."""
+        kernel = self.gp.kernel
+        assert isinstance(kernel, SquaredExponential | Matern)
+        phase = (inputs / kernel.lengthscale.unsqueeze(-2)) @ self.frequencies.mT
+        amplitude = (kernel.outputscale / self.frequencies.shape[-2]).sqrt()[..., None, None]
+        return amplitude * torch.cat([phase.cos(), phase.sin()], -1)
+
+
+def _unit_frequencies(
+    kernel: SquaredExponential | Matern, count: int, dims: int, generator: torch.Generator
+) -> Float[Tensor, "F D"]:
+    """Frequencies from the spectrum of the kernel of unit length scales.
+
+    Normal for a squared exponential; for Matérn ν Student's t of 2ν degrees of freedom: Rasmussen and
+    Williams (2006), section 4.2.1.
+    """
+    normal = torch.randn(count, dims, generator=generator, dtype=torch.float64)
+    if isinstance(kernel, SquaredExponential):
+        return normal
+    freedom = round(2 * kernel.smoothness)
+    square = torch.randn(count, freedom, generator=generator, dtype=torch.float64).square().sum(-1)
+    return normal * (freedom / square).sqrt().unsqueeze(-1)

@@ -3,55 +3,65 @@
     python train.py                                            policy gradients on the pendulum's swing-up
     python train.py policy-gradient --help                     every option with its unit
     python train.py policy-gradient --task pendulum-explore    another task
+    python train.py --config FILE --learners 20                a run's config.yaml or your own; options win
+    python train.py --resume RUN                               go on where a run was stopped or killed
+    python train.py evaluate RUN                               returns without exploration
+    python train.py render RUN                                 a film of a learner
+    python train.py plot RUN RUN ...                           learning curves in one picture
+    python train.py report RUN                                 draw a run again, on one page
+    python train.py tasks                                      what can be learned
 
 Ctrl-C ends a run early and keeps what was learned; a second Ctrl-C aborts at once.
 """
 
 import contextlib
-import io
-import os
-import re
-import signal
+import math
 import sys
 import time
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import Any, NamedTuple
 
 import torch
 import tyro
-from tensordict import TensorDict
-from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl import logger as torchrl_logger
 
 import envs
-from torch_gprl.learners import PolicyGradient, PolicyGradientConfig
+from torch_gprl.critics import GPActionValue
+from torch_gprl.learners import PolicyGradient, PolicyGradientConfig, QLearning, QLearningConfig
 from torch_gprl.runs import (
+    Algorithm,
     Checkpoints,
+    CommandLine,
+    LoggerName,
     MetricsWriter,
     Progress,
+    RunFailure,
     RunFolder,
-    Surface,
+    StopRequest,
     UserError,
-    bootstrap_interval,
+    check_logger,
+    compare_curves,
     evaluate,
     film,
+    foresee,
+    foresight_figure,
     learning_curve,
     read_metrics,
     save_figure,
+    summary,
+    value_on_plane,
     value_surface,
+    write_report,
     write_video,
 )
 
 EVALUATION_SEED = 1_000_000  # the starts of all evaluations, whatever the run's own seed
-CHECKPOINT_INTERVAL = 60.0  # s
-GRID = 61  # points of the value surface in each direction
-POINTS_AT_ONCE = 500  # of the value surface, for each learner: bounds the memory
 LONGEST_FILM = 300  # frames
-STDERR = 2  # file descriptor
-BOX_SIDES, BOX_RULES = "│| ", "─-"  # how tyro draws with UTF-8 and without
+JUDGED_EPISODES = 5  # over which a critic's foresight is shown
+PICTURES = Path(__file__).parent / "docs" / "tasks.jpg"
 
 
 @dataclass(frozen=True)
@@ -66,6 +76,8 @@ class RunOptions:
     device: str = "cpu"  # where policy and critic live: cpu, cuda, cuda:1, ...
     out: Path | None = None  # run folder, new or empty; unless given runs/<task>-<algorithm>-<date>-<time>
     evaluation_episodes: int = 20  # episodes of the final evaluation, for each learner
+    checkpoint_interval: float = 60.0  # s between checkpoints; changes no result
+    logger: LoggerName = "tensorboard"  # of the curves, beside metrics.csv; csv writes that table alone
 
     def __post_init__(self) -> None:
         """Refuse what no run can start with."""
@@ -74,6 +86,8 @@ class RunOptions:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, but is {self.seed}")
+        if not self.checkpoint_interval >= 0:
+            raise ValueError(f"checkpoint_interval must not be negative, but is {self.checkpoint_interval}")
 
 
 @dataclass(frozen=True)
@@ -84,84 +98,155 @@ class PolicyGradientOptions:
     algorithm: tyro.conf.OmitArgPrefixes[PolicyGradientConfig] = field(default_factory=PolicyGradientConfig)
 
 
-class Algorithm(NamedTuple):
-    """A way to learn: its options and the class that does it."""
+@dataclass(frozen=True)
+class QLearningOptions:
+    """Learn action values by a Gaussian process, and act greedily on them."""
 
-    options: type[PolicyGradientOptions]
-    learner: type[PolicyGradient]
+    run: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
+    algorithm: tyro.conf.OmitArgPrefixes[QLearningConfig] = field(default_factory=QLearningConfig)
 
 
-ALGORITHMS = {"policy-gradient": Algorithm(PolicyGradientOptions, PolicyGradient)}
+# A rollout holds whole episodes, and values look ahead as far as the task's steps are short.
+POLICY_GRADIENT_PRESETS: dict[str, dict[str, object]] = {
+    "pendulum-explore": {"discount": 0.97},
+    "cartpole-balance": {"rollout_steps": 500, "discount": 0.99},
+    "cartpole-swingup": {"rollout_steps": 250, "total_frames": 300_000},
+    "InvertedPendulum-v5": {"rollout_steps": 1000, "discount": 0.99},
+    "HalfCheetah-v5": {"rollout_steps": 1000, "total_frames": 1_000_000, "discount": 0.99},
+}
+Options = PolicyGradientOptions | QLearningOptions
+Learner = PolicyGradient | QLearning
+ALGORITHMS = {
+    "policy-gradient": Algorithm(PolicyGradientOptions, PolicyGradient, POLICY_GRADIENT_PRESETS),
+    "q-learning": Algorithm(QLearningOptions, QLearning),
+}
+
+
+@dataclass(frozen=True)
+class ResumeOptions:
+    """Go on where a run was stopped or killed, as if it had not been."""
+
+    folder: tyro.conf.Positional[Path]  # the run's folder
+    checkpoint: int | None = None  # update to go on from; the latest unless given
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """Returns of a run's policies without exploration."""
+
+    folder: tyro.conf.Positional[Path]  # the run's folder
+    checkpoint: int | None = None  # update whose policies are judged; the latest unless given
+    episodes: int = 100  # for each learner
+    seed: int = EVALUATION_SEED  # of the episodes' starts
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Film one learner's policy, without exploration, through an episode."""
+
+    folder: tyro.conf.Positional[Path]  # the run's folder
+    checkpoint: int | None = None  # update whose policy is shown; the latest unless given
+    learner: int | None = None  # whom to show; the best in 20 episodes unless given
+    seed: int = EVALUATION_SEED  # of the episode's start
+    out: Path | None = None  # the film, ending in .mp4; unless given in the run's folder
+
+
+@dataclass(frozen=True)
+class PlotOptions:
+    """Learning curves of runs in one picture, each with the band of its learners."""
+
+    folders: tyro.conf.Positional[tuple[Path, ...]]  # the runs' folders
+    metric: str = "return"  # column of metrics.csv
+    out: Path = Path("comparison.png")  # the picture: .png, .pdf or .svg
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Evaluate and draw a run again, and write its report.html."""
+
+    folder: tyro.conf.Positional[Path]  # the run's folder
+    checkpoint: int | None = None  # update that is shown; the latest unless given
+
+
+@dataclass(frozen=True)
+class TasksOptions:
+    """List the tasks."""
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command line; return the exit code: 0, 2 for an error of the user, 130 if aborted."""
+    """Run the command line; return the exit code: 0, 1 for a failed run, 2 for an error of the user, 130."""
+    torchrl_logger.setLevel("WARNING")  # it tells of buffers on standard output
     try:
         name, options = parse(arguments)
-        run(name, options)
-    except UserError as error:
+        if name in ALGORITHMS:
+            start(name, options)
+        else:
+            COMMANDS[name](options)
+    except (UserError, RunFailure) as error:
         print(f"train.py: {error}", file=sys.stderr)
-        return 2
+        return 2 if isinstance(error, UserError) else 1
     except KeyboardInterrupt:
         print("train.py: aborted", file=sys.stderr)
         return 130
     return 0
 
 
-def parse(arguments: list[str]) -> tuple[str, PolicyGradientOptions]:
-    """Turn the command line into an algorithm's name and its options.
-
-    Raises:
-        UserError: what tyro would show in a box, on one line.
-    """
-    named = bool(arguments) and not arguments[0].startswith("-")
-    name, *rest = arguments if named else ["policy-gradient", *arguments]
-    if name not in ALGORITHMS:
-        raise UserError(f"unknown algorithm '{name}'; choose one of {', '.join(ALGORITHMS)}")
-    complaint = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(complaint):
-            return name, tyro.cli(ALGORITHMS[name].options, args=rest, prog=f"train.py {name}")
-    except SystemExit as end:
-        if end.code in (0, None):
-            raise
-        raise UserError(_one_line(complaint.getvalue())) from None
+def parse(arguments: list[str]) -> tuple[str, Any]:
+    """The name of an algorithm or a command, and its options."""
+    return CommandLine(__doc__ or "", ALGORITHMS, OPTIONS).parse(arguments)
 
 
-def _one_line(box: str) -> str:
-    """The text of tyro's box without the box and its colours: its parts joined by semicolons."""
-    parts: list[list[str]] = [[]]
-    for line in re.sub(r"\x1b\[[\d;]*m", "", box).splitlines()[1:-1]:
-        words = line.strip(BOX_SIDES).split()
-        if set("".join(words)) <= set(BOX_RULES):
-            parts.append([])
-        else:
-            parts[-1] += words
-    return "; ".join(" ".join(part) for part in parts)
-
-
-def run(name: str, options: PolicyGradientOptions) -> None:
-    """Train, evaluate, and leave everything in the run folder."""
-    _check_device(options.run.device)
-    torch.set_num_threads(options.run.threads)
-    torch.manual_seed(options.run.seed)
-    env = make_env(options.run, options.run.num_envs, options.run.seed)
-    with _construction_errors():
-        learner = ALGORITHMS[name].learner(env, options.algorithm, seed=options.run.seed)
+def start(name: str, options: Options) -> None:
+    """Train, evaluate, and leave everything in a new run folder."""
+    check_logger(options.run.logger)
+    learner = build(name, options)
     folder = RunFolder(options.run.out) if options.run.out else RunFolder.named(options.run.task, name)
     folder.write_config({"algorithm": name, "run": options.run, "config": options.algorithm})
     print(
         f"{name} on {options.run.task}: {options.run.learners} learners, results in {folder.path}", flush=True
     )
-    train(learner, options, folder)
-    returns = evaluate(
-        make_env(options.run, options.run.evaluation_episodes, EVALUATION_SEED), learner.policy
-    )
-    best = int(returns.mean(dim=1).argmax())
-    folder.write_evaluation(returns)
-    print(summary(returns), flush=True)
-    draw(learner, options.run, folder, best)
-    print(f"everything is in {folder.path}", flush=True)
+    learn(learner, options.run, folder)
+    conclude(learner, options.run, folder)
+
+
+def resume(options: ResumeOptions) -> None:
+    """Take up a run from its checkpoint, or from its start if it has none yet."""
+    run = opened(options.folder, options.checkpoint)
+    check_logger(run.options.logger)
+    print(f"going on after update {run.learner.updates} in {run.folder.path}", flush=True)
+    learn(run.learner, run.options, run.folder, resumed=True)
+    conclude(run.learner, run.options, run.folder)
+
+
+class Run(NamedTuple):
+    """A run that was started earlier, as it stands at a checkpoint."""
+
+    folder: RunFolder
+    options: RunOptions
+    learner: Learner
+
+
+def opened(path: Path, checkpoint: int | None) -> Run:
+    """The run of a folder, at an update or as late as there is a checkpoint."""
+    folder = RunFolder.opened(path)
+    name, settings = CommandLine("", ALGORITHMS, OPTIONS).settings_of(folder.config)
+    options = parse([name, *settings])[1]
+    learner = build(name, options)
+    checkpoints = Checkpoints(folder.checkpoints, learner=learner)
+    file = checkpoints.latest() if checkpoint is None else checkpoints.at(checkpoint)
+    if file is not None:
+        checkpoints.load(file)
+    return Run(folder, options.run, learner)
+
+
+def build(name: str, options: Options) -> Learner:
+    """The learner with its environment, at the start of a run."""
+    _check_device(options.run.device)
+    torch.set_num_threads(options.run.threads)
+    torch.manual_seed(options.run.seed)
+    env = make_env(options.run, options.run.num_envs, options.run.seed)
+    with _construction_errors():
+        return ALGORITHMS[name].learner(env, options.algorithm, seed=options.run.seed)
 
 
 def make_env(options: RunOptions, num_envs: int, seed: int) -> Any:  # noqa: ANN401  (TorchRL's EnvBase and more)
@@ -194,109 +279,143 @@ def _construction_errors() -> Iterator[None]:
         raise UserError(" ".join(str(error.args[0] if error.args else error).split())) from error
 
 
-def train(learner: PolicyGradient, options: PolicyGradientOptions, folder: RunFolder) -> None:
+def learn(learner: Learner, options: RunOptions, folder: RunFolder, resumed: bool = False) -> None:
     """Train to the end or to the first Ctrl-C, recording every update."""
     checkpoints = Checkpoints(folder.checkpoints, learner=learner)
-    metrics = MetricsWriter(folder.metrics, folder.tensorboard)
-    title = f"{options.run.task}, {options.run.learners} learners"
-    last_saved = time.monotonic()
+    after = learner.updates if resumed else None
+    metrics = MetricsWriter(folder.metrics, folder.curves(options.logger), options.logger, after)
+    title = f"{options.task}, {options.learners} learners"
+    saved = -math.inf  # s; the first update is saved, so that a failure leaves something to go on from
     with (
         contextlib.closing(metrics),
+        _failures(learner, folder),
         StopRequest() as stop,
-        Progress(options.algorithm.total_frames, title) as progress,
+        Progress(learner.config.total_frames, title, before=learner.frames) as progress,
     ):
         for values in learner.train():
             metrics.write(learner.updates, learner.frames, values)
             progress.update(learner.frames, values)
-            if time.monotonic() - last_saved > CHECKPOINT_INTERVAL:
+            if time.monotonic() - saved > options.checkpoint_interval:
+                metrics.sync()
                 checkpoints.save(learner.updates)
-                last_saved = time.monotonic()
+                saved = time.monotonic()
             if stop.asked:
                 break
-    checkpoints.save(learner.updates)
+        checkpoints.save(learner.updates)
     if stop.asked:
         print(f"stopped after {learner.frames} environment steps per learner", flush=True)
 
 
-class StopRequest:
-    """Within it the first Ctrl-C (or SIGTERM) only sets `asked`; the second Ctrl-C interrupts as usual."""
-
-    def __init__(self) -> None:
-        self.asked = False
-
-    def __enter__(self) -> "StopRequest":
-        self._before = {kind: signal.signal(kind, self._ask) for kind in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for kind, handler in self._before.items():
-            signal.signal(kind, handler)
-
-    def _ask(self, kind: int, frame: FrameType | None) -> None:
-        self.asked = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        # print may be what was interrupted, and does not bear a second call inside the first.
-        os.write(STDERR, b"\nfinishing this update; Ctrl-C again aborts\n")
+@contextlib.contextmanager
+def _failures(learner: Learner, folder: RunFolder) -> Iterator[None]:
+    """Whatever breaks while learning ends the run with its cause and the way to go on."""
+    try:
+        yield
+    except Exception as error:
+        with contextlib.suppress(OSError):  # the disk may be what failed
+            folder.failure.write_text(traceback.format_exc(), encoding="utf-8")
+        cause = " ".join(f"{type(error).__name__}: {error}".split())
+        raise RunFailure(
+            f"failed after update {learner.updates} by {cause} (the trace is in {folder.failure}); "
+            f"--resume {folder.path} goes on from the last checkpoint"
+        ) from error
 
 
-def summary(returns: Tensor) -> str:
-    """The final result in one line; over learners, or over episodes if there is one learner.
-
-    Args:
-        returns: `[learners, episodes]`.
-    """
-    learners, episodes = returns.shape
-    values = (returns.mean(dim=1) if learners > 1 else returns[0]).cpu().numpy()
-    over = f"{learners} learners, {episodes} episodes each" if learners > 1 else f"{episodes} episodes"
-    low, high = bootstrap_interval(values)
-    return (
-        f"final return {values.mean():.2f}, 95 % interval [{low:.2f}, {high:.2f}], "
-        f"worst {values.min():.2f}, best {values.max():.2f}, over {over}"
-    )
+def conclude(learner: Learner, options: RunOptions, folder: RunFolder) -> None:
+    """Evaluate what was learned, draw it, and put it all on one page."""
+    env = make_env(options, options.evaluation_episodes, EVALUATION_SEED)
+    returns = evaluate(env, learner.policy)
+    folder.write_evaluation(returns)
+    print(summary(returns), flush=True)
+    draw(learner, options, folder, best=int(returns.mean(dim=1).argmax()))
+    write_report(folder)
+    print(f"everything is in {folder.path}", flush=True)
 
 
-def draw(learner: PolicyGradient, options: RunOptions, folder: RunFolder, best: int) -> None:
-    """Draw the learning curve, and the best learner's value function and behaviour."""
+def draw(learner: Learner, options: RunOptions, folder: RunFolder, best: int) -> None:
+    """Draw the learning curve, and the best learner's value function, foresight and behaviour."""
     recorded = read_metrics(folder.metrics)
     curve = learning_curve(recorded["frames"][:, 0], recorded["return"], title=options.task)
     save_figure(curve, folder.figures / "learning_curve.png")
     env = make_env(options, num_envs=1, seed=EVALUATION_SEED)
-    if env.plane is not None:
-        surface = value_on_plane(learner, env.plane, best)
-        save_figure(
-            value_surface(surface, f"{options.task}, best learner"), folder.figures / "value_surface.png"
-        )
+    critic, title = learner.critic, f"{options.task}, best learner"
+    if env.plane is not None and isinstance(critic, GPActionValue):
+        surface = value_on_plane(critic, learner.policy, env.plane, best)
+        save_figure(value_surface(surface, title), folder.figures / "value_surface.png")
+    if isinstance(critic, GPActionValue):
+        starts = make_env(options, JUDGED_EPISODES, EVALUATION_SEED)
+        foresight = foresee(starts, learner.policy, critic, learner.config.discount, best)
+        save_figure(foresight_figure(foresight, title), folder.figures / "foresight.png")
     frames = film(env, learner.policy, best, LONGEST_FILM)
     write_video(folder.videos / "best_learner.mp4", frames, round(1 / env.task.control_step))
 
 
-def value_on_plane(learner: PolicyGradient, plane: envs.Plane, best: int) -> Surface:
-    """One learner's posterior of V(s) = Q(s, f(s)) on a grid of the task's picture plane."""
-    critic, gp = learner.critic, learner.critic.gp
-    learners = len(gp.size)
-    x, y = (torch.linspace(low, high, GRID) for low, high in zip(plane.low, plane.high, strict=True))
-    points = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2).to(gp.basis.device)
-    observations = plane.to_observation(points).float()
-    means, variances = [], []
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        for some in observations.split(POINTS_AT_ONCE):
-            states = TensorDict(
-                {"observation": some.expand(learners, -1, -1)}, batch_size=(learners, len(some))
-            )
-            value = critic.value(states["observation"], learner.policy(states)["action"])
-            means.append(value.mean[best])
-            variances.append(value.variance[best])
-    basis = gp.basis[best, : int(gp.size[best])] * critic.input_scale[best] + critic.input_loc[best]
-    observed = basis[:, : observations.shape[-1]]
-    return Surface(
-        x=x.double().numpy(),
-        y=y.double().numpy(),
-        mean=torch.cat(means).double().cpu().numpy().reshape(GRID, GRID),
-        stddev=torch.cat(variances).double().sqrt().cpu().numpy().reshape(GRID, GRID),
-        basis=plane.from_observation(observed).double().cpu().numpy(),
-        labels=plane.labels,
-    )
+def evaluate_run(options: EvaluateOptions) -> None:
+    """Print the returns of every learner, and the summary."""
+    run = opened(options.folder, options.checkpoint)
+    returns = evaluate(make_env(run.options, options.episodes, options.seed), run.learner.policy)
+    for learner, value in enumerate(returns.mean(dim=1).tolist()):
+        print(f"learner {learner}: mean return {value:.2f}")
+    print(f"after update {run.learner.updates}: {summary(returns)}")
 
+
+def render(options: RenderOptions) -> None:
+    """Write a film of one learner."""
+    run = opened(options.folder, options.checkpoint)
+    learner = options.learner
+    if learner is None:
+        returns = evaluate(make_env(run.options, 20, EVALUATION_SEED), run.learner.policy)
+        learner = int(returns.mean(dim=1).argmax())
+    if not 0 <= learner < run.options.learners:
+        raise UserError(f"learner must lie between 0 and {run.options.learners - 1}, but is {learner}")
+    path = options.out or run.folder.videos / f"learner-{learner}.mp4"
+    env = make_env(run.options, num_envs=1, seed=options.seed)
+    write_video(path, film(env, run.learner.policy, learner, LONGEST_FILM), round(1 / env.task.control_step))
+    print(path)
+
+
+def plot(options: PlotOptions) -> None:
+    """Draw the learning curves of several runs into one picture."""
+    curves = {}
+    for path in options.folders:
+        recorded = read_metrics(RunFolder.opened(path).metrics)
+        if options.metric not in recorded:
+            raise UserError(f"{path} has no metric '{options.metric}'; choose one of {', '.join(recorded)}")
+        curves[path.name] = recorded["frames"][:, 0], recorded[options.metric]
+    save_figure(compare_curves(curves, options.metric), options.out)
+    print(options.out)
+
+
+def report(options: ReportOptions) -> None:
+    """Evaluate and draw a run again."""
+    run = opened(options.folder, options.checkpoint)
+    conclude(run.learner, run.options, run.folder)
+
+
+def list_tasks(options: TasksOptions) -> None:
+    """Print the tasks, a line each, and where they are pictured."""
+    for task in envs.ALL.values():
+        about = (type(task).__doc__ or "").splitlines()[0]
+        print(f"{task.id:26s}{about} {task.horizon} steps of {task.control_step:g} s")
+    print(f"pictures: {PICTURES}")
+
+
+OPTIONS = {
+    "resume": ResumeOptions,
+    "evaluate": EvaluateOptions,
+    "render": RenderOptions,
+    "plot": PlotOptions,
+    "report": ReportOptions,
+    "tasks": TasksOptions,
+}
+COMMANDS: dict[str, Callable[[Any], None]] = {
+    "resume": resume,
+    "evaluate": evaluate_run,
+    "render": render,
+    "plot": plot,
+    "report": report,
+    "tasks": list_tasks,
+}
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

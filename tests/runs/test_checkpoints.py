@@ -2,6 +2,7 @@
 
 import pickle
 import random
+import resource
 import zipfile
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
+from torchrl.checkpoint import CheckpointError
 
 from torch_gprl.runs import Checkpoints, UserError
 
@@ -77,11 +79,47 @@ def test_the_last_two_are_kept(tmp_path):
     assert checkpoints.latest() == paths[2]
 
 
-def test_the_latest_is_the_newest_that_can_be_read(tmp_path):
+@pytest.mark.parametrize("kept", [100, -1])
+def test_of_a_damaged_checkpoint_the_last_good_one_is_named(tmp_path, kept):
     checkpoints = Checkpoints(tmp_path, learner=Learner())
-    first, second = checkpoints.save(1), checkpoints.save(2)
-    second.write_bytes(second.read_bytes()[:100])  # a power failure
-    assert checkpoints.latest() == first
+    first, second = checkpoints.save(9), checkpoints.save(10)
+    second.write_bytes(second.read_bytes()[:kept])  # a power failure
+    assert checkpoints.latest() == second
+    with pytest.raises(UserError, match="the file is damaged, but checkpoint 9 is whole: --checkpoint 9"):
+        checkpoints.load(second)
+    assert checkpoints.at(9) == first
+    checkpoints.load(first)
+
+
+def test_with_no_good_checkpoint_none_is_named(tmp_path):
+    checkpoints = Checkpoints(tmp_path, learner=Learner())
+    for path in (checkpoints.save(1), checkpoints.save(2)):
+        path.write_bytes(b"")
+    with pytest.raises(UserError, match="must be whole and from a run with the same options"):
+        checkpoints.load(checkpoints.latest())
+
+
+def test_a_checkpoint_that_is_not_there_is_refused_with_those_that_are(tmp_path):
+    checkpoints = Checkpoints(tmp_path, learner=Learner())
+    checkpoints.save(3), checkpoints.save(20)
+    with pytest.raises(UserError, match=r"there is no checkpoint 7 in .*; there are: 3, 20"):
+        checkpoints.at(7)
+
+
+def test_a_full_disk_leaves_the_last_checkpoint(tmp_path):
+    learner = Learner()
+    checkpoints = Checkpoints(tmp_path, learner=learner)
+    path = checkpoints.save(1)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (500, limits[1]))  # every longer file fails as on a full disk
+    try:
+        with pytest.raises((OSError, RuntimeError, CheckpointError)):
+            checkpoints.save(2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert checkpoints.latest() == path
+    checkpoints.load(path)
+    assert checkpoints.save(2) == checkpoints.latest()
 
 
 def test_without_checkpoints_there_is_no_latest(tmp_path):

@@ -8,7 +8,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from torch_gprl.runs import evaluate, film
+from torch_gprl.runs import evaluate, film, summary
 
 
 class Countdown(EnvBase):
@@ -73,3 +73,14 @@ def test_a_film_ends_with_the_episode_or_at_its_limit(most_frames, expected):
     env.length = torch.full((2, 1, 1), 3.0)
     frames = film(env, POLICY, learner=1, most_frames=most_frames)
     assert frames[:, 0, 0, 0].tolist() == expected
+
+
+def test_the_summary_is_over_learners():
+    assert summary(torch.tensor([[1.0, 3.0], [4.0, 4.0], [6.0, 6.0]])).startswith("final return 4.00, ")
+    assert "worst 2.00, best 6.00, over 3 learners, 2 episodes each" in summary(
+        torch.tensor([[1.0, 3.0], [4.0, 4.0], [6.0, 6.0]])
+    )
+
+
+def test_the_summary_of_one_learner_is_over_its_episodes():
+    assert "worst 1.00, best 3.00, over 2 episodes" in summary(torch.tensor([[1.0, 3.0]]))

@@ -4,28 +4,46 @@ Nothing here knows what is learned: these take tensors, arrays and labels.
 """
 
 from torch_gprl.runs.checkpoints import Checkpoints
-from torch_gprl.runs.errors import UserError
-from torch_gprl.runs.evaluation import evaluate, film
-from torch_gprl.runs.figures import Surface, learning_curve, save_figure, value_surface
+from torch_gprl.runs.command_line import Algorithm, CommandLine
+from torch_gprl.runs.curves import LoggerName, check_logger
+from torch_gprl.runs.errors import RunFailure, UserError
+from torch_gprl.runs.evaluation import evaluate, film, summary
+from torch_gprl.runs.figures import Surface, compare_curves, learning_curve, save_figure, value_surface
 from torch_gprl.runs.folder import RunFolder
+from torch_gprl.runs.foresight import foresee, foresight_figure
 from torch_gprl.runs.intervals import bootstrap_interval
 from torch_gprl.runs.metrics import MetricsWriter, read_metrics
 from torch_gprl.runs.progress import Progress
+from torch_gprl.runs.report import write_report
+from torch_gprl.runs.stopping import StopRequest
+from torch_gprl.runs.surfaces import value_on_plane
 from torch_gprl.runs.video import write_video
 
 __all__ = [
+    "Algorithm",
     "Checkpoints",
+    "CommandLine",
+    "LoggerName",
     "MetricsWriter",
     "Progress",
+    "RunFailure",
     "RunFolder",
+    "StopRequest",
     "Surface",
     "UserError",
     "bootstrap_interval",
+    "check_logger",
+    "compare_curves",
     "evaluate",
     "film",
+    "foresee",
+    "foresight_figure",
     "learning_curve",
     "read_metrics",
     "save_figure",
+    "summary",
+    "value_on_plane",
     "value_surface",
+    "write_report",
     "write_video",
 ]

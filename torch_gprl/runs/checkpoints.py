@@ -6,7 +6,9 @@ comparison of shapes before anything is overwritten, and a flush to the disk.
 """
 
 import os
+import re
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -23,6 +25,7 @@ from torchrl.checkpoint import (
 
 from torch_gprl.runs.errors import UserError
 
+NAME = re.compile(r"checkpoint-(\d+)\.torchrl")
 KEPT = 2  # the newest, and the one before in case the newest was cut off by a crash
 
 
@@ -74,23 +77,58 @@ class Checkpoints:
         return path
 
     def latest(self) -> Path | None:
-        """The newest readable checkpoint, if there is one."""
-        return self._rotation.latest()
+        """The newest checkpoint, if there is one; it may be damaged."""
+        files = self._files()
+        return files[max(files)] if files else None
+
+    def at(self, step: int) -> Path:
+        """The checkpoint of a step.
+
+        Raises:
+            UserError: if there is none; the message names those there are.
+        """
+        files = self._files()
+        if step not in files:
+            there = ", ".join(map(str, sorted(files))) or "none"
+            raise UserError(
+                f"there is no checkpoint {step} in {self._rotation.directory}; there are: {there}"
+            )
+        return files[step]
+
+    def _files(self) -> dict[int, Path]:
+        """Step -> file, of good checkpoints and damaged ones."""
+        names = {path: NAME.fullmatch(path.name) for path in self._rotation.directory.glob("*")}
+        return {int(name[1]): path for path, name in names.items() if name}
 
     def load(self, path: Path) -> None:
         """Restore all components from a file.
 
         Raises:
-            UserError: if the file is missing, damaged, of another format, or of a run with other shapes.
+            UserError: if the file is missing, damaged, of another format, or of a run with other shapes; if
+                it is damaged the message names the newest one that is not.
         """
         try:
             self._checkpoint.load(path)
         except (CheckpointError, zipfile.BadZipFile, OSError, ValueError, KeyError, EOFError) as error:
             reason = " ".join(str(error).split())
-            raise UserError(
-                f"cannot load checkpoint {path}: {reason} (the file must be whole and from a run with the"
-                " same options)"
-            ) from error
+            raise UserError(f"cannot load checkpoint {path}: {reason} ({self._way_out(path)})") from error
+
+    def _way_out(self, path: Path) -> str:
+        if _is_whole(path):
+            return "the file must be from a run with the same options"
+        good = [step for step, other in self._files().items() if other != path and _is_whole(other)]
+        if good:
+            return f"the file is damaged, but checkpoint {max(good)} is whole: --checkpoint {max(good)}"
+        return "the file must be whole and from a run with the same options"
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether the checksums of a file hold."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.testzip() is None
+    except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error):
+        return False
 
 
 class _PlainState(CheckpointAdapter):

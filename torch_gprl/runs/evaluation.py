@@ -10,6 +10,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torch_gprl.runs.intervals import bootstrap_interval
+
 SIDE = 320  # width and height of a film, pixels; the time to draw grows with its square
 
 
@@ -48,6 +50,22 @@ def evaluate(env: EnvBase, policy: TensorDictModuleBase) -> Float[Tensor, "learn
             returns += step["next", "reward"].squeeze(-1).where(running, 0)
             running &= ~step["next", "done"].squeeze(-1)
     return returns
+
+
+def summary(returns: Float[Tensor, "learners episodes"]) -> str:
+    """The final result in one line; over learners, or over episodes if there is one learner.
+
+    Args:
+        returns: of every episode.
+    """
+    learners, episodes = returns.shape
+    values = (returns.mean(dim=1) if learners > 1 else returns[0]).cpu().numpy()
+    over = f"{learners} learners, {episodes} episodes each" if learners > 1 else f"{episodes} episodes"
+    low, high = bootstrap_interval(values)
+    return (
+        f"final return {values.mean():.2f}, 95 % interval [{low:.2f}, {high:.2f}], "
+        f"worst {values.min():.2f}, best {values.max():.2f}, over {over}"
+    )
 
 
 def film(

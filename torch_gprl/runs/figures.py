@@ -4,6 +4,7 @@ Everything is drawn on `matplotlib.figure.Figure` objects, without pyplot and it
 needed and nothing has to be closed.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from torch_gprl.runs.intervals import bootstrap_interval
 FEWEST_FOR_INTERVAL = 5  # learners; a bootstrap of fewer is much too narrow
 COLOUR = "#1f4e8c"
 DOTS_PER_INCH = 200
+PANELS_IN_A_ROW = 3
 
 
 def learning_curve(
@@ -50,8 +52,61 @@ def learning_curve(
         axes.axhline(threshold, color="0.35", linestyle="--", linewidth=1, label=f"solved: {threshold:g}")
     axes.set(xlabel="environment steps per learner", ylabel="return per episode", title=title)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    _open_frame(axes)
+    open_frame(axes)
     axes.legend(frameon=False, fontsize="small", loc="best")
+    return figure
+
+
+def compare_curves(
+    curves: Mapping[str, tuple[Num[np.ndarray, " updates"], Float[np.ndarray, "updates learners"]]],
+    label: str,
+) -> Figure:
+    """Mean over learners of several runs against experience, each with its band as in `learning_curve`.
+
+    Args:
+        curves: name of the run -> environment steps per learner, and the metric of each learner.
+        label: what the metric is.
+    """
+    figure = Figure(figsize=(6.4, 4), layout="constrained")
+    axes = figure.add_subplot()
+    for place, (name, (frames, values)) in enumerate(curves.items()):
+        colour = f"C{place % 10}"
+        learners = values.shape[1]
+        if learners > 1:
+            _, low, high = _band(values)
+            axes.fill_between(frames, low, high, color=colour, alpha=0.2, linewidth=0)
+        of = f" ({learners} learners)" if learners > 1 else ""
+        axes.plot(frames, values.mean(axis=1), color=colour, linewidth=1.8, label=f"{name}{of}")
+    axes.set(xlabel="environment steps per learner", ylabel=label)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    open_frame(axes)
+    axes.legend(frameon=False, fontsize="small", loc="best")
+    return figure
+
+
+def metric_panels(
+    frames: Num[np.ndarray, " updates"], metrics: Mapping[str, Float[np.ndarray, "updates learners"]]
+) -> Figure:
+    """One small panel for each metric: its mean over learners, and the range from the worst to the best.
+
+    Args:
+        frames: environment steps per learner at each update.
+        metrics: name -> values of each learner; NaN where there is none yet.
+    """
+    rows = max(1, -(-len(metrics) // PANELS_IN_A_ROW))
+    figure = Figure(figsize=(9.2, 2.1 * rows), layout="constrained")
+    grid = figure.subplots(rows, PANELS_IN_A_ROW, sharex=True, squeeze=False).ravel()
+    for axes, (name, values) in zip(grid, metrics.items(), strict=False):
+        axes.fill_between(
+            frames, values.min(axis=1), values.max(axis=1), color=COLOUR, alpha=0.25, linewidth=0
+        )
+        axes.plot(frames, values.mean(axis=1), color=COLOUR, linewidth=1.2)
+        axes.set_title(name.replace("_", " "), fontsize="medium")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        open_frame(axes)
+    for axes in grid[len(metrics) :]:
+        axes.set_visible(False)
+    figure.supxlabel("environment steps per learner", fontsize="small")
     return figure
 
 
@@ -124,7 +179,8 @@ def save_figure(figure: Figure, path: Path) -> None:
     figure.savefig(path, dpi=DOTS_PER_INCH)
 
 
-def _open_frame(axes: Axes) -> None:
+def open_frame(axes: Axes) -> None:
+    """Draw only the axes' lines that carry a scale, and a light grid."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.margins(x=0)
     axes.grid(alpha=0.25, linewidth=0.5)

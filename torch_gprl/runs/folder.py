@@ -4,9 +4,11 @@
       config.yaml        every option as resolved, versions, git commit, command line
       metrics.csv        one row per update and learner
       evaluation.csv     one row per learner and episode of the final evaluation
-      tensorboard/       the same numbers as TensorBoard events
+      tensorboard/       the same numbers as TensorBoard events, or what another logger writes
       checkpoints/       the last two states
       figures/  videos/
+      report.html        all of it on one page
+      failure.txt        what ended the run, if something did
 
 A run can be understood, drawn again and repeated from its folder alone.
 """
@@ -55,6 +57,21 @@ class RunFolder:
             raise UserError(f"cannot write run folder {path}: {reason}; name another folder") from error
 
     @classmethod
+    def opened(cls, path: Path) -> "RunFolder":
+        """The folder of a run that has been started.
+
+        Raises:
+            UserError: if it holds no run.
+        """
+        folder = cls.__new__(cls)
+        folder.path = path
+        if not folder.config.is_file():
+            raise UserError(f"{path} holds no run: there is no {folder.config.name} in it")
+        for place in (folder.checkpoints, folder.figures, folder.videos):
+            place.mkdir(exist_ok=True)
+        return folder
+
+    @classmethod
     def named(cls, task: str, algorithm: str, root: Path = Path("runs")) -> "RunFolder":
         """Make `root/<task>-<algorithm>-<date>-<time>`, numbered if two runs start in the same second."""
         name = f"{task.replace('/', '-')}-{algorithm}-{datetime.now():%Y%m%d-%H%M%S}"
@@ -64,14 +81,18 @@ class RunFolder:
         return cls(candidate)
 
     @property
+    def config(self) -> Path:
+        """The file of the options."""
+        return self.path / "config.yaml"
+
+    @property
     def metrics(self) -> Path:
         """The file of the metrics."""
         return self.path / "metrics.csv"
 
-    @property
-    def tensorboard(self) -> Path:
-        """The folder of the TensorBoard events."""
-        return self.path / "tensorboard"
+    def curves(self, logger: str) -> Path:
+        """The folder of what a logger writes."""
+        return self.path / logger
 
     @property
     def checkpoints(self) -> Path:
@@ -88,6 +109,16 @@ class RunFolder:
         """The folder of the videos."""
         return self.path / "videos"
 
+    @property
+    def failure(self) -> Path:
+        """The file that tells what ended the run."""
+        return self.path / "failure.txt"
+
+    @property
+    def report(self) -> Path:
+        """The page that shows all of it."""
+        return self.path / "report.html"
+
     def write_config(self, options: Mapping[str, object]) -> None:
         """Write `config.yaml`: the options, and what else it takes to repeat the run.
 
@@ -102,7 +133,9 @@ class RunFolder:
             "versions": _versions(),
         }
         text = yaml.safe_dump(record, sort_keys=False, allow_unicode=True)
-        (self.path / "config.yaml").write_text(text, encoding="utf-8")
+        unfinished = self.config.with_suffix(".part")
+        unfinished.write_text(text, encoding="utf-8")
+        unfinished.replace(self.config)  # whoever finds a config finds a whole one
 
     def write_evaluation(self, returns: Float[Tensor, "learners episodes"]) -> None:
         """Write `evaluation.csv`: the return of every episode of the final evaluation."""

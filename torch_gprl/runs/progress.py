@@ -23,6 +23,7 @@ class Progress:
         title: what is running.
         console: where to show it; standard error by default, so that results alone reach standard output.
         clock: seconds, monotonic.
+        before: environment steps per learner that were taken earlier, if the run is resumed.
     """
 
     def __init__(
@@ -31,8 +32,9 @@ class Progress:
         title: str,
         console: Console | None = None,
         clock: Callable[[], float] = time.monotonic,
+        before: int = 0,
     ) -> None:
-        self._total_frames = total_frames
+        self._total_frames, self._before = total_frames, before
         self._title = title
         self._console = console or Console(stderr=True)
         self._clock = clock
@@ -57,7 +59,7 @@ class Progress:
             metrics: name -> values `[learners]`; `return` is among them.
         """
         now, learners = self._clock(), len(metrics["return"])
-        speed = frames / max(now - self._start, 1e-9)  # steps per second and learner
+        speed = (frames - self._before) / max(now - self._start, 1e-9)  # steps per second and learner
         facts = {label: _mean_and_spread(metrics[name]) for name, label in SHOWN.items() if name in metrics}
         facts["steps/s"] = f"{speed * learners:,.0f}"
         facts["left"] = _duration((self._total_frames - frames) / speed)

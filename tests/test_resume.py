@@ -1,0 +1,87 @@
+"""Resuming: a run that was killed anywhere and resumed leaves the metrics of one that was not."""
+
+import os
+import random
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+import train
+
+SMALL = {
+    "policy-gradient": "--rollout-steps 20 --total-frames 600 --budget 15 --trust-region 0.02",
+    "q-learning": "--rollout-steps 10 --total-frames 300 --budget 15 --sweeps 3",
+}
+COMMON = "--learners 2 --num-envs 2 --logger csv --checkpoint-interval"
+
+
+def in_a_process(arguments: list[str]) -> int:
+    """Start the command line in a fork, which needs no new imports; returns its process id."""
+    child = os.fork()
+    if child == 0:
+        os.setsid()
+        code = 70
+        try:
+            for stream in (1, 2):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+            code = train.main(arguments)
+        finally:
+            os._exit(code)
+    return child
+
+
+def run(arguments: list[str], kill_after: float | None = None) -> int | None:
+    """The exit code, or None if the run was killed after some seconds."""
+    child = in_a_process(arguments)
+    if kill_after is not None:
+        time.sleep(kill_after)
+        os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    return None if os.WIFSIGNALED(status) else os.waitstatus_to_exitcode(status)
+
+
+@pytest.fixture(scope="module", params=SMALL)
+def undisturbed(request, tmp_path_factory):
+    """Name and options of a run, its metrics, and how long it took."""
+    folder = tmp_path_factory.mktemp("undisturbed") / "run"
+    arguments = [request.param, *SMALL[request.param].split(), *COMMON.split()]
+    started = time.monotonic()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "conclude", lambda *finished: None)  # evaluation and pictures take longer
+        assert run([*arguments, "1000", "--out", str(folder)]) == 0
+        yield arguments, (folder / "metrics.csv").read_bytes(), time.monotonic() - started
+
+
+def resumed_metrics(arguments: list[str], folder: Path, moments: list[float]) -> bytes:
+    """Start, kill and resume, once for each moment, then to the end."""
+    command = [*arguments, "--out", str(folder)]
+    for moment in moments:
+        if run(command, kill_after=moment) is not None:
+            break
+        started = (folder / "config.yaml").exists()
+        command = ["--resume", str(folder)] if started else [*arguments, "--out", str(folder / "again")]
+        folder = folder if started else folder / "again"
+    assert run(command) == 0
+    return (folder / "metrics.csv").read_bytes()
+
+
+def kill_points(undisturbed, tmp_path, number: int) -> None:
+    arguments, metrics, seconds = undisturbed
+    chance = random.Random(len(arguments))
+    for attempt in range(number):
+        interval = chance.choice(["0", "0.1", "1000"])
+        moments = [chance.uniform(0.02, seconds) for _ in range(chance.choice([1, 2]))]
+        folder = tmp_path / f"{attempt}"
+        assert resumed_metrics([*arguments, interval], folder, moments) == metrics, (interval, moments)
+
+
+def test_a_killed_run_resumes_bit_for_bit(undisturbed, tmp_path):
+    assert undisturbed[1].count(b"\n") == 31  # a header, and 15 updates of two learners
+    kill_points(undisturbed, tmp_path, 3)
+
+
+@pytest.mark.slow
+def test_a_killed_run_resumes_bit_for_bit_wherever_it_was_killed(undisturbed, tmp_path):
+    kill_points(undisturbed, tmp_path, 20)

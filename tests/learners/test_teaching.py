@@ -4,14 +4,15 @@ import io
 import itertools
 from typing import Any, get_args
 
+import jaxtyping
 import pytest
 import torch
 
 import envs
-from torch_gprl.critics import EstimatorName
+from torch_gprl.critics import EstimatorName, KernelName
 from torch_gprl.gp import AgeAwareScore
 from torch_gprl.learners import PolicyGradient, PolicyGradientConfig
-from torch_gprl.learners.config import BY_STATE_VALUES, Optimiser
+from torch_gprl.learners.config import BY_STATE_VALUES, Optimiser, Targets
 
 ENVS, STEPS = 4, 25
 
@@ -54,6 +55,15 @@ def test_every_optimiser_moves_the_policy(optimiser):
     before = [parameter.clone() for parameter in made.policy.parameters()]
     list(made.train())
     assert all(not torch.equal(old, new) for old, new in zip(before, made.policy.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("targets", get_args(Targets))
+@pytest.mark.parametrize("name", get_args(KernelName))
+def test_every_kernel_serves(name, targets):
+    made = learner(2, kernel=name, targets=targets, visited=120)
+    for figures in made.train():
+        assert (figures["gradient_norm"] > 0).all()
+        assert figures["explained_variance"].isfinite().all()
 
 
 def test_exploration_is_learned_or_fixed_or_on_schedule():
@@ -140,12 +150,15 @@ def test_a_saved_run_goes_on_as_it_would_have(numbers):
 @pytest.mark.parametrize(
     ("numbers", "message"),
     [
+        ({"kernel": "linear"}, "kernel must be one of squared-exponential, matern-1/2"),
+        ({"kernel": "successor", "discount": 1.0}, "'successor' needs a discount between 0 and 1, got 1.0"),
         ({"replay": 100}, "needs targets 'differences'"),
         ({"replay": -1}, "replay must be at least 0"),
         ({"age_weight": 1.5}, "age_weight must lie between 0 and 1, got 1.5"),
         ({"noise": 0.0}, "noise must be positive"),
     ],
 )
-def test_numbers_out_of_range_are_refused(numbers, message):
+def test_numbers_out_of_range_are_refused(numbers, message, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as users run it, without the hook
     with pytest.raises(ValueError, match=message):
         PolicyGradientConfig(**numbers)

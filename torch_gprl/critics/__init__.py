@@ -4,6 +4,14 @@ from torch_gprl.critics.action_value import GPActionValue
 from torch_gprl.critics.calibration import correlation, interval_coverage
 from torch_gprl.critics.estimators import ESTIMATORS, USE_ALL_ACTIONS, EstimatorName, Evaluation
 from torch_gprl.critics.gaussian_actions import action_moments, clipped_moments
+from torch_gprl.critics.kernels_by_name import (
+    KernelName,
+    action_value_kernel,
+    clear_graphs,
+    follow_basis,
+    graphs,
+    store_transitions,
+)
 from torch_gprl.critics.returns import k_step_returns
 from torch_gprl.critics.value_estimator import Critic, GPStateValue, GPValueEstimator
 
@@ -16,9 +24,15 @@ __all__ = [
     "GPActionValue",
     "GPStateValue",
     "GPValueEstimator",
+    "KernelName",
     "action_moments",
+    "action_value_kernel",
+    "clear_graphs",
     "clipped_moments",
     "correlation",
+    "follow_basis",
+    "graphs",
     "interval_coverage",
     "k_step_returns",
+    "store_transitions",
 ]

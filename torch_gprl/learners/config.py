@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from torch_gprl.critics import EstimatorName
+from torch_gprl.critics import EstimatorName, KernelName
 
 ControllerForm = Literal["linear", "rbf", "mlp"]
 CriticForm = Literal["gp", "neural"]
@@ -16,6 +16,7 @@ AgeForm = Literal["exponential", "logit"]
 CHOICES = {
     "critic": CriticForm,
     "estimator": EstimatorName,
+    "kernel": KernelName,
     "controller": ControllerForm,
     "optimiser": Optimiser,
     "exploration": Exploration,
@@ -32,7 +33,15 @@ BY_STATE_VALUES = (
     "k-step-baseline",
     "generalised",
 )
-LEAST = {"total_frames": 1, "rollout_steps": 1, "budget": 1, "renew_every": 1, "horizon": 0, "replay": 0}
+LEAST = {
+    "total_frames": 1,
+    "rollout_steps": 1,
+    "budget": 1,
+    "visited": 20,
+    "renew_every": 1,
+    "horizon": 0,
+    "replay": 0,
+}
 POSITIVE = (
     "std",
     "final_std",
@@ -70,6 +79,8 @@ class PolicyGradientConfig:
 
     targets: Targets = "returns"  # the critic learns values from returns, or rewards as temporal differences
     in_sample: bool = False  # the critic learns a rollout before it judges it
+    kernel: KernelName = "squared-exponential"  # of states; of actions it is the squared exponential
+    visited: int = 1_000  # newest transitions that the kernels "geodesic" and "successor" stand on
     budget: int = 150  # basis vectors of the critic
     novelty_threshold: float = 0.3  # novelty that makes a point a basis vector, in noise variances
     renew_every: int = 20  # policy updates between renewals of the critic, which forget older data; 1: each
@@ -105,6 +116,8 @@ class PolicyGradientConfig:
     def _check_combinations(self) -> None:
         if self.replay and self.targets != "differences":
             raise ValueError("replay solves temporal differences anew and needs targets 'differences'")
+        if self.kernel in ("geodesic", "successor") and not 0 < self.discount < 1:
+            raise ValueError(f"kernel {self.kernel!r} needs a discount between 0 and 1, got {self.discount}")
         if self.critic == "neural" and self.estimator not in BY_STATE_VALUES:
             choices = ", ".join(BY_STATE_VALUES)
             raise ValueError(

@@ -13,14 +13,22 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torch_gprl.critics import GPActionValue
+from torch_gprl.critics import (
+    GPActionValue,
+    action_value_kernel,
+    clear_graphs,
+    follow_basis,
+    graphs,
+    store_transitions,
+)
 from torch_gprl.gp import AgeAwareScore, InformationScore, SparseOnlineGP, fit_hyperparameters
-from torch_gprl.kernels import SquaredExponential
 from torch_gprl.learners.config import PolicyGradientConfig
 from torch_gprl.policies import GaussianPolicy
 
 FIT_POINTS = 160  # points of a rollout that a fit of hyper-parameters sees; its cost is cubic in them
+TUNING_NODES = 60  # of a graph of basis vectors while its kernel is fitted
 FIRST_FIT, LATER_FITS = 50, 20  # steps of the optimiser: later fits start from the last
+GRAPH_FITS_SHORTER = 4  # times: a graph is searched anew at every step
 FIRST_NOISE = 0.05  # noise variance of standardised targets before the first fit
 REMEMBERED = (
     "observation",
@@ -39,7 +47,9 @@ def make_critic(policy: GaussianPolicy, config: PolicyGradientConfig, learners: 
     lengthscale[:states] = config.lengthscale * math.sqrt(states)
     if config.targets == "returns":  # fitted from the first rollout on
         lengthscale.fill_(1)
-    kernel = SquaredExponential(states + actions, lengthscale, batch_shape=(learners,))
+    # a basis overshoots its budget by a quarter at most
+    capacity = config.budget + config.budget // 4 + 1 if config.kernel == "shortest-path" else config.visited
+    kernel = action_value_kernel(config.kernel, lengthscale, actions, learners, config.discount, capacity)
     pruning = InformationScore()
     if config.age_weight:
         pruning = AgeAwareScore(config.age_weight, config.age_form, config.age_timescale)
@@ -73,6 +83,7 @@ class Teacher:
         young = update & (update - 1) == 0  # a power of two: values change fast at first
         if update % config.renew_every == 0 or (young and update < config.renew_every):
             self._renew(rollout, update)
+        store_transitions(self.critic, rollout)
         if config.targets == "returns":
             self.critic.update(rollout, stamp=update)
         elif self.replay is None:
@@ -80,12 +91,14 @@ class Teacher:
         else:
             self.replay.extend(rollout.select(*REMEMBERED).reshape(rollout.shape[0], -1).transpose(0, 1))
             self.critic.resolve(self._remembered(self.replay), self.policy, config.discount, stamp=update)
+        follow_basis(self.critic)
 
     def _renew(self, rollout: TensorDictBase, update: int) -> None:
         """Forget, and set scaling and hyper-parameters by this rollout."""
         critic, gp = self.critic, self.critic.gp
         data = rollout.get("observation"), rollout.get("action")
         critic.standardise(*data, rollout.get("value_target"))
+        clear_graphs(critic)
         if self.config.targets == "differences":
             reward = rollout.get(("next", "reward")).flatten(1).to(gp.basis.dtype)
             # rewards without spread would leave no noise at all
@@ -93,10 +106,26 @@ class Teacher:
             with torch.no_grad():
                 gp.log_noise_variance.copy_((self.config.noise * variance).log())
             return
-        inputs, targets = critic.inputs(*data), critic.standard_targets(rollout.get("value_target"))
-        chosen = torch.linspace(0, inputs.shape[1] - 1, min(FIT_POINTS, inputs.shape[1])).long()
-        steps = FIRST_FIT if update == 0 else LATER_FITS
-        fit_hyperparameters(gp, inputs[:, chosen], targets[:, chosen], steps)
+        self._fit(rollout, FIRST_FIT if update == 0 else LATER_FITS)
+
+    def _fit(self, rollout: TensorDictBase, steps: int) -> None:
+        """Hyper-parameters by this rollout; on a graph of one half of it by the other.
+
+        A graph tells more of the states that it stands on than of new ones.
+        """
+        critic, points = self.critic, rollout
+        if any(True for _ in graphs(critic)):
+            stored, points = rollout.chunk(2, dim=1 if rollout.shape[1] > 1 else 2)
+            store_transitions(critic, stored)
+            states = critic.inputs(stored.get("observation"), stored.get("action"))
+            follow_basis(critic, _spread_over(states, min(TUNING_NODES, self.config.budget)))
+            steps //= GRAPH_FITS_SHORTER
+        inputs = critic.inputs(points.get("observation"), points.get("action"))
+        targets = critic.standard_targets(points.get("value_target"))
+        fit_hyperparameters(
+            critic.gp, _spread_over(inputs, FIT_POINTS), _spread_over(targets, FIT_POINTS), steps
+        )
+        clear_graphs(critic)
 
     @staticmethod
     def _remembered(replay: TensorDictReplayBuffer) -> TensorDictBase:
@@ -123,3 +152,8 @@ class Teacher:
         self.critic.load_state_dict(state["critic"])
         if self.replay is not None and state["replay"] is not None:
             self.replay.load_state_dict(state["replay"])
+
+
+def _spread_over(data: Tensor, count: int) -> Tensor:
+    """So many rows of data [learners, N, ...], evenly spread over all."""
+    return data[:, torch.linspace(0, data.shape[1] - 1, min(count, data.shape[1])).long()]

@@ -1,0 +1,117 @@
+"""Kernels of action values by name: what they are, and the graphs that grow under them."""
+
+from typing import get_args
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torch_gprl.critics import (
+    GPActionValue,
+    KernelName,
+    action_value_kernel,
+    clear_graphs,
+    follow_basis,
+    graphs,
+    store_transitions,
+)
+from torch_gprl.gp import SparseOnlineGP
+from torch_gprl.graphs import Experience, TransitionGraph
+from torch_gprl.kernels import GaussianInputs, Matern, SquaredExponential
+
+LEARNERS, STATES, ACTIONS, DISCOUNT = 2, 2, 1, 0.9
+LENGTHSCALE = torch.tensor([0.5, 0.8, 3.0], dtype=torch.float64)
+ON_GRAPHS = ("shortest-path", "geodesic", "successor")
+
+
+def made(name: KernelName, capacity: int = 80) -> GPActionValue:
+    kernel = action_value_kernel(name, LENGTHSCALE, ACTIONS, LEARNERS, DISCOUNT, capacity)
+    return GPActionValue(SparseOnlineGP(kernel, 40, 0.05, 0.0))
+
+
+def transitions(steps: int = 20) -> TensorDict:
+    """Two trajectories of each learner that turn in the plane."""
+    turn = torch.tensor([[0.9, -0.3], [0.3, 0.9]], dtype=torch.float64)
+    path = [torch.randn(LEARNERS, 2, STATES, dtype=torch.float64)]
+    for _ in range(steps):
+        path.append(path[-1] @ turn.mT)
+    states = torch.stack(path, 2)
+    shape = (LEARNERS, 2, steps)
+    following = {"observation": states[:, :, 1:], "terminated": torch.zeros(*shape, 1, dtype=torch.bool)}
+    data = {
+        "observation": states[:, :, :-1],
+        "action": torch.randn(*shape, ACTIONS, dtype=torch.float64),
+        "next": TensorDict(following, shape),
+        "value_target": states[:, :, :-1, :1],
+    }
+    return TensorDict(data, shape)
+
+
+@pytest.mark.parametrize("name", get_args(KernelName))
+def test_covariances_are_positive_and_averages_over_actions_are_closed(name):
+    critic, data = made(name), transitions()
+    store_transitions(critic, data)
+    critic.update(data)
+    follow_basis(critic)
+    x = critic.inputs(data["observation"], data["action"])
+    with torch.no_grad():
+        kernel = critic.gp.kernel
+        assert kernel.batch_shape == (LEARNERS,)
+        assert torch.linalg.eigvalsh(kernel(x, x)).min() > -1e-9
+        spread = GaussianInputs(x[:, :3], torch.full((LEARNERS, 3, 1), 0.49, dtype=torch.float64), (2,))
+        drawn = x[:, :3].repeat(1, 2_000, 1)
+        drawn[..., 2] += 0.7 * torch.randn(LEARNERS, 6_000, dtype=torch.float64)
+        sampled = kernel(drawn, x[:, 5:6]).reshape(LEARNERS, 2_000, 3, 1).mean(1)
+        torch.testing.assert_close(kernel.expected(spread, x[:, 5:6]), sampled, rtol=0.02, atol=2e-3)
+
+
+def test_without_a_graph_they_are_the_stationary_kernels_of_that_name():
+    x = torch.randn(LEARNERS, 5, 3, dtype=torch.float64)
+    squared = made("squared-exponential").gp.kernel(x, x)
+    torch.testing.assert_close(squared, SquaredExponential(3, LENGTHSCALE)(x, x))
+    matern = made("matern-1/2").gp.kernel(x, x)
+    action = SquaredExponential(1, LENGTHSCALE[2])(x[..., 2:], x[..., 2:])
+    expected = Matern(2, LENGTHSCALE[:2], smoothness=0.5)(x[..., :2], x[..., :2]) * action
+    torch.testing.assert_close(matern, expected)
+
+
+@pytest.mark.parametrize("name", ON_GRAPHS)
+def test_graphs_grow_with_experience_and_keep_the_newest(name):
+    critic = made(name, capacity=60)
+    for round_ in range(2):
+        data = transitions()
+        store_transitions(critic, data)
+        critic.update(data)
+        follow_basis(critic)
+        (graph,) = graphs(critic)
+        if isinstance(graph, TransitionGraph):
+            assert torch.equal(graph.size, critic.gp.size)
+        else:
+            assert int(graph.size) == min(40 * (round_ + 1), 60)
+            newest = data["observation"].flatten(1, 2)[:, -40:]
+            torch.testing.assert_close(graph.states[:, int(graph.size) - 40 : int(graph.size)], newest)
+    clear_graphs(critic)
+    (graph,) = graphs(critic)
+    assert not graph.mask.any()
+    assert all(torch.isfinite(part).all() for part in critic.value(data["observation"], data["action"]))
+
+
+def test_more_transitions_than_a_graph_holds_leave_the_newest():
+    critic, data = made("successor", capacity=30), transitions()
+    store_transitions(critic, data)
+    (graph,) = graphs(critic)
+    assert isinstance(graph, Experience)
+    torch.testing.assert_close(graph.states, data["observation"].flatten(1, 2)[:, -30:])
+
+
+def test_a_saved_critic_brings_its_graph_along():
+    critic, other, data = made("geodesic"), made("geodesic"), transitions()
+    store_transitions(critic, data)
+    critic.update(data)
+    other.load_state_dict(critic.state_dict())
+    for found, expected in zip(
+        other.value(data["observation"], data["action"]),
+        critic.value(data["observation"], data["action"]),
+        strict=True,
+    ):
+        torch.testing.assert_close(found, expected)

@@ -1,0 +1,172 @@
+"""Kernels of action values by name, and the graphs of experience that some of them stand on.
+
+k((s, a), (s', a')) = k_s(s, s') · k_a(a, a'), with any kernel of states k_s and a squared exponential k_a,
+which keeps averages over a Gaussian policy in closed form. The graph of a kernel belongs to it, and so to what
+is saved and moved with the critic; a learner calls `store_transitions` before the critic learns them,
+`follow_basis` afterwards, and `clear_graphs` when it scales the inputs anew.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.distributions import LogNormal
+
+from torch_gprl.critics.action_value import GPActionValue
+from torch_gprl.graphs import Experience, NearestEdges, TransitionGraph
+from torch_gprl.kernels import (
+    Columns,
+    GeodesicKernel,
+    Kernel,
+    Matern,
+    ShortestPathKernel,
+    SquaredExponential,
+    SuccessorKernel,
+)
+from torch_gprl.kernels.graph_successor import FIRST_DOUBT
+
+KernelName = Literal[
+    "squared-exponential",
+    "matern-1/2",
+    "matern-3/2",
+    "matern-5/2",
+    "shortest-path",
+    "geodesic",
+    "successor",
+]
+SMOOTHNESS = {"matern-1/2": 0.5, "matern-3/2": 1.5, "matern-5/2": 2.5}
+NEIGHBOURS = 4  # of a state on a graph of basis vectors
+LOOKAHEAD = 5  # steps that a state off the graph is followed; more would cost more than they tell
+REST = 0.2  # prior variance of what the successor kernel cannot tell
+PRIOR_WIDTH = 0.3  # standard deviation of logarithms
+
+
+def action_value_kernel(
+    name: KernelName,
+    lengthscale: Float[Tensor, " D"],
+    actions: int,
+    learners: int,
+    discount: float,
+    capacity: int,
+) -> Kernel:
+    """The kernel of that name over (state, action), with parameters of its own for each learner.
+
+    Args:
+        name: of the kernel of states.
+        lengthscale: of the columns of states, then of those of actions, in units of the critic's inputs. A
+            kernel on a graph takes the mean of the former.
+        actions: how many columns are actions.
+        learners: independent learners.
+        discount: γ; a kernel on a graph needs it below 1.
+        capacity: states that a graph holds: the newest visited ones, or a basis with its overshoot.
+
+    Raises:
+        ValueError: a number that no such kernel takes.
+    """
+    dims = len(lengthscale)
+    if name == "squared-exponential":
+        return SquaredExponential(dims, lengthscale, batch_shape=(learners,))
+    states = dims - actions
+    of_states = _state_kernel(name, lengthscale[:states], learners, discount, capacity)
+    of_actions = SquaredExponential(actions, lengthscale[states:], batch_shape=(learners,))
+    first, last = tuple(range(states)), tuple(range(states, dims))
+    return Columns(of_states, first, dims) * Columns(of_actions, last, dims)
+
+
+def _state_kernel(
+    name: KernelName, lengthscale: Tensor, learners: int, discount: float, capacity: int
+) -> Kernel:
+    dims, batch, length = len(lengthscale), (learners,), float(lengthscale.mean())
+    if name in SMOOTHNESS:
+        return Matern(dims, lengthscale, batch_shape=batch, smoothness=SMOOTHNESS[name])
+    if name == "shortest-path":
+        graph = TransitionGraph(dims, capacity, NearestEdges(NEIGHBOURS), batch)
+        return ShortestPathKernel(graph, length, interpolate=NEIGHBOURS)
+    visited = Experience(dims, capacity, min(128, capacity), batch_shape=batch)
+    if name == "geodesic":
+        return GeodesicKernel(visited, discount, length)
+    return successor_with_rest(visited, discount, length, LOOKAHEAD)
+
+
+def successor_with_rest(visited: Experience, discount: float, lengthscale: float, lookahead: int) -> Kernel:
+    """The successor kernel, with an ordinary one for what it cannot tell and priors that keep this one alive.
+
+    Without priors the marginal likelihood of a few hundred returns, most of them told exactly by the graph,
+    leaves no variance for the few that are not.
+
+    Args:
+        visited: states and transitions.
+        discount: γ, below 1.
+        lengthscale: the first one of both kernels, and the median of its prior, in units of the inputs.
+        lookahead: as `SuccessorKernel`.
+    """
+    dims, batch = visited.states.shape[-1], visited.states.shape[:-2]
+    told = SuccessorKernel(visited, discount, lengthscale, lookahead=lookahead)
+    rest = Matern(dims, lengthscale, REST, batch, smoothness=0.5)
+    for kernel in (told, rest):
+        kernel.set_prior("lengthscale", LogNormal(math.log(lengthscale), PRIOR_WIDTH))
+    told.set_prior("outputscale", LogNormal(0.0, PRIOR_WIDTH))
+    told.set_prior("doubt", LogNormal(math.log(FIRST_DOUBT), PRIOR_WIDTH))
+    rest.set_prior("outputscale", LogNormal(math.log(REST), PRIOR_WIDTH))
+    return told + rest
+
+
+def graphs(critic: GPActionValue) -> Iterator[TransitionGraph | Experience]:
+    """The graphs that the critic's kernel stands on; none under an ordinary kernel."""
+    for module in critic.gp.kernel.modules():
+        if isinstance(module, TransitionGraph | Experience):
+            yield module
+
+
+@torch.no_grad()
+def store_transitions(critic: GPActionValue, transitions: TensorDictBase) -> None:
+    """Store transitions in the graph of visited states; nothing under a kernel without one.
+
+    What the critic has learned before it sees through the new graph.
+
+    Args:
+        critic: whose kernel it is.
+        transitions: [learners, ...] with observation, action, and under "next" observation and terminated.
+    """
+    for graph in graphs(critic):
+        if isinstance(graph, TransitionGraph):
+            continue
+        dims = graph.states.shape[-1]
+        action, following = transitions.get(critic.in_keys[1]), transitions.get("next")
+        states, next_states = (
+            critic.inputs(part.get(critic.in_keys[0]), action)[..., :dims]
+            for part in (transitions, following)
+        )
+        terminated = following.get("terminated").reshape(states.shape[:-1])
+        newest = slice(-graph.capacity, None)
+        graph.add(states[:, newest], next_states[:, newest], terminated[:, newest])
+
+
+@torch.no_grad()
+def follow_basis(critic: GPActionValue, nodes: Tensor | None = None) -> None:
+    """Let the graph of basis vectors be that of the basis as it is now; nothing under other kernels.
+
+    Args:
+        critic: whose kernel it is.
+        nodes: inputs [learners, N, D] to follow instead, such as those of a fit of hyper-parameters.
+    """
+    basis, mask = critic.gp.basis, critic.gp.mask
+    if nodes is not None:
+        basis, mask = nodes, torch.ones(nodes.shape[:-1], dtype=torch.bool, device=nodes.device)
+    for graph in graphs(critic):
+        if isinstance(graph, TransitionGraph):
+            graph.follow(basis[..., : graph.points.shape[-1]], mask)
+
+
+@torch.no_grad()
+def clear_graphs(critic: GPActionValue) -> None:
+    """Forget all states: the scaling of the inputs has changed, or a new task begins."""
+    for graph in graphs(critic):
+        if isinstance(graph, TransitionGraph):
+            graph.eliminate(graph.mask)
+        else:
+            graph.size.zero_()

@@ -1,8 +1,8 @@
 """Kernels of action values by name, and the graphs of experience that some of them stand on.
 
 k((s, a), (s', a')) = k_s(s, s') · k_a(a, a'), with any kernel of states k_s and a squared exponential k_a,
-which keeps averages over a Gaussian policy in closed form. The graph of a kernel belongs to it, and so to what
-is saved and moved with the critic; a learner calls `store_transitions` before the critic learns them,
+which keeps averages over a Gaussian policy in closed form. The graph of a kernel belongs to it, and so to
+what is saved and moved with the critic. A learner calls `store_transitions` before the critic learns them,
 `follow_basis` afterwards, and `clear_graphs` when it scales the inputs anew.
 """
 

@@ -13,8 +13,10 @@ it has.
 
 import copy
 import functools
+import signal
 import tempfile
 from collections.abc import Callable, Sequence
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +82,7 @@ class WorkerCollection:
             self._start()
         try:
             return next(self._rollouts)
-        except RuntimeError as error:
+        except Exception as error:  # TorchRL may fail in ending the other workers
             raise RuntimeError(
                 f"a worker failed: {self._cause() or error}. What was learned until now is unharmed: "
                 "save it, or go on from the last checkpoint"
@@ -106,16 +108,19 @@ class WorkerCollection:
             total_frames=-1,
             weight_sync_schemes={"policy": NoWeightSyncScheme()},
             auto_register_policy_transforms=False,
-            collector_class=functools.partial(ReportingCollector, reports=folder, track_traj_ids=False),
-            use_buffers=True,
+            collector_class=functools.partial(ReportingCollector, reports=folder),
             **options,
         )
         self._rollouts = iter(self._collector)
 
     def _cause(self) -> str:
-        """What failed workers have left word of."""
+        """What failed workers have left word of, or how they ended."""
         reports = sorted(Path(self._folder.name).glob("worker-*.txt"))
-        return "; ".join(f"{path.stem}: {path.read_text(encoding='utf-8')}" for path in reports)
+        if reports:
+            return "; ".join(f"{path.stem}: {path.read_text(encoding='utf-8')}" for path in reports)
+        assert self._collector is not None
+        codes = enumerate(map(_exit_code, self._collector.procs))
+        return "; ".join(f"worker-{i} ended with exit code {code}" for i, code in codes if code)
 
     def close(self) -> None:
         """End the workers."""
@@ -194,7 +199,7 @@ class FollowingPolicy(TensorDictModuleBase):
 
 
 class ReportingCollector(Collector):
-    """A worker's collector, which leaves the cause in a file when it fails; TorchRL leaves it on the screen."""
+    """A worker's collector, which leaves the cause in a file when it fails; TorchRL prints it at most."""
 
     def __init__(self, *args: Any, reports: Path, worker_idx: int | None = None, **options: Any) -> None:  # noqa: ANN401
         self.report = reports / f"worker-{worker_idx}.txt"
@@ -218,6 +223,14 @@ def copied_for_workers(modules: nn.ModuleDict, count: int) -> list[nn.ModuleDict
             for module, own in zip(originals[1:], noise.split(count), strict=True):
                 module.noise = own
     return copies
+
+
+def _exit_code(process: BaseProcess) -> int | None:
+    """How a process ended, unless it runs, or was ended by TorchRL because another one had failed."""
+    try:
+        return None if process.exitcode == -signal.SIGTERM else process.exitcode
+    except ValueError:  # closed
+        return None
 
 
 def _made(factory: Callable[[], EnvBase]) -> EnvBase:

@@ -270,7 +270,7 @@ def test_a_saved_run_goes_on_as_it_would_have(targets):
 def test_exploration_is_uniform_at_first_then_round_the_greedy_action_and_absent_when_asked():
     learner = QLearning(pendulums(2), config(epsilon=0.0, std=0.05))
     states = TensorDict({"observation": torch.randn(2, 500, 3, dtype=torch.float64)}, [2, 500])
-    high = learner.policy.maximiser.high
+    high = learner.maximiser.high
     first = learner.policy(states.clone())["action"] / high
     assert first.abs().max() <= 1
     # Kolmogorov's 99.99 % bound for 1,000 uniform numbers

@@ -21,7 +21,7 @@ from torch_gprl.kernels import SquaredExponential
 from torch_gprl.learners.collecting import Collection
 from torch_gprl.learners.q_learning_config import QLearningConfig
 from torch_gprl.learners.q_targets import FittedQ, OnlineQ
-from torch_gprl.policies.greedy import GreedyPolicy
+from torch_gprl.policies import BehaviourPolicy
 
 
 class QLearning:
@@ -45,10 +45,11 @@ class QLearning:
         states = env.observation_spec["observation"].shape[-1]
         low, high = action_box_of(env)
         self.critic = make_critic(config, self.learners, states, low, high)
-        maximiser = ActionMaximiser(self.critic, low, high, config.candidates)
+        self.maximiser = ActionMaximiser(self.critic, low, high, config.candidates)
         indices = range(first_learner, first_learner + self.learners)
-        self.policy = GreedyPolicy(maximiser, config.std, 1.0, seed, indices)
-        self.teacher = (FittedQ if config.targets == "fitted" else OnlineQ)(self.critic, maximiser, config)
+        self.policy = BehaviourPolicy(config, self.maximiser, seed, indices)
+        teacher = FittedQ if config.targets == "fitted" else OnlineQ
+        self.teacher = teacher(self.critic, self.maximiser, config)
         self.collection = Collection(env, self.policy, config.rollout_steps)
         self.frames_per_update = num_envs * config.rollout_steps
         self.total_updates = -(-config.total_frames // self.frames_per_update)
@@ -63,10 +64,11 @@ class QLearning:
     def train(self) -> Iterator[dict[str, Tensor]]:
         """Run the remaining updates; yields figures of each, [learners] every one."""
         while self.updates < self.total_updates:
+            self.policy.anneal(self.updates / self.total_updates)
             rollout = self.collection.rollout()
             error = self._surprise(rollout)
             self.teacher.learn(rollout)
-            self.policy.epsilon = self.config.epsilon if self.teacher.taught else 1.0
+            self.policy.uniform = not self.teacher.taught
             self.updates += 1
             yield self._figures(rollout) | {"td_error": error}
 
@@ -74,7 +76,7 @@ class QLearning:
     def _surprise(self, rollout: TensorDictBase) -> Tensor:
         """Root mean square of r + γ max_a Q(s', a) − Q(s, a) on experience that the critic has not seen."""
         following = rollout.get("next")
-        value = self.policy.maximiser(following.get("observation")).value
+        value = self.maximiser(following.get("observation")).value
         beyond = torch.where(following.get("terminated").squeeze(-1), 0.0, value)
         target = following.get("reward").squeeze(-1) + self.config.discount * beyond
         expected = self.critic.mean_value(rollout.get("observation"), rollout.get("action"))
@@ -101,7 +103,7 @@ class QLearning:
             "updates": self.updates,
             "teacher": self.teacher.state_dict(),
             "collection": self.collection.state_dict(),
-            "noise": self.policy.noise.state(),
+            "exploration": self.policy.exploration_state(),
             "last_return": self._last_return,
         }
 
@@ -109,9 +111,9 @@ class QLearning:
         """Take up what `state_dict` gave."""
         self.updates = state["updates"]
         self.teacher.load_state_dict(state["teacher"])
-        self.policy.epsilon = self.config.epsilon if self.teacher.taught else 1.0
+        self.policy.uniform = not self.teacher.taught
         self.collection.load_state_dict(state["collection"])
-        self.policy.noise.restore(state["noise"])
+        self.policy.restore_exploration(state["exploration"])
         self._last_return = state["last_return"]
 
 

@@ -4,15 +4,17 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from torch_gprl.policies import Behaviour
+
 Targets = Literal["fitted", "online"]
 
 LEAST = {"total_frames": 1, "rollout_steps": 1, "budget": 1, "horizon": 1, "sweeps": 1, "candidates": 3}
 POSITIVE = ("noise", "lengthscale", "action_lengthscale", "novelty_threshold")
-SHARES = ("discount", "learning_rate", "epsilon", "growth")
+SHARES = ("discount", "learning_rate", "growth")
 
 
 @dataclass(frozen=True)
-class QLearningConfig:
+class QLearningConfig(Behaviour):
     """Q-learning with a Gaussian process for the action value."""
 
     total_frames: int = 5_000  # environment steps per learner, over all its environments
@@ -25,8 +27,6 @@ class QLearningConfig:
     learning_rate: float = 1.0  # step from the old value to the target, from 0 to 1; online
     horizon: int = 1  # real rewards before the maximum over actions, m of (.8); online
 
-    std: float = 0.3  # of the noise round the greedy action, in halves of the actuator's range
-    epsilon: float = 0.0  # probability of an action uniform in the box
     candidates: int = 25  # actions compared in a maximisation
     optimism: float = 0.0  # what is not known is this many deviations of the value above its mean; fitted
 
@@ -42,6 +42,7 @@ class QLearningConfig:
         Raises:
             ValueError: naming the field, its value and what would be valid.
         """
+        super().__post_init__()
         for name, least in LEAST.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
@@ -51,8 +52,6 @@ class QLearningConfig:
         for name in SHARES:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie between 0 and 1, got {getattr(self, name)}")
-        if not 0 <= self.std < math.inf:
-            raise ValueError(f"std must be at least 0, got {self.std}")
         if not math.isfinite(self.optimism):
             raise ValueError(f"optimism must be finite, got {self.optimism}")
         if self.targets not in get_args(Targets):

@@ -1,5 +1,6 @@
 """Policies: deterministic controllers f(s, θ) and the exploration round them."""
 
+from torch_gprl.policies.behaviour import Behaviour, BehaviourPolicy, Scheme
 from torch_gprl.policies.confidence_noise import ConfidenceNoise, ConfidenceScale, Greedy, action_box
 from torch_gprl.policies.controllers import (
     Controller,
@@ -14,6 +15,8 @@ from torch_gprl.policies.optimistic import ThompsonSampling, UpperConfidence
 from torch_gprl.policies.streams import NoiseStream
 
 __all__ = [
+    "Behaviour",
+    "BehaviourPolicy",
     "ConfidenceNoise",
     "ConfidenceScale",
     "Controller",
@@ -27,6 +30,7 @@ __all__ = [
     "NormalPolicy",
     "RBFController",
     "ScaledController",
+    "Scheme",
     "ThompsonSampling",
     "UpperConfidence",
     "action_box",

@@ -130,6 +130,16 @@ class ThompsonSampling(MaximisingPolicy):
         self._normal: Tensor | None = None
         self._paths: Paths | None = None
 
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """The present episodes' functions, for `state_dict`."""
+        normal = torch.zeros(0) if self._normal is None else self._normal
+        return {"normal": normal, "frequencies": self.sampler.frequencies}
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Continue the functions of a `state_dict`."""
+        self._normal = state["normal"] if state["normal"].numel() else None
+        self.sampler.frequencies = state["frequencies"]
+
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""

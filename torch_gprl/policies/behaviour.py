@@ -45,7 +45,7 @@ class Behaviour:
 
     exploration: Scheme = "gaussian"  # of the action round the greedy one; torch_gprl.policies.behaviour
     std: float = 0.3  # of the gaussian noise at first, in halves of the actuator's range
-    final_std: float = 0.3  # of the gaussian noise at last; it goes in equal steps
+    final_std: float | None = None  # of the gaussian noise at last, in equal steps; as at first unless told
     epsilon: float = 0.0  # gaussian: probability of an action uniform in the box
     bonus: float = 1.0  # upper: standard deviations of the value added to its mean
     confidence: ConfidenceScale = field(default_factory=ConfidenceScale)
@@ -57,7 +57,7 @@ class Behaviour:
             known = ", ".join(get_args(Scheme))
             raise ValueError(f"exploration must be one of {known}, got {self.exploration!r}")
         for name in ("std", "final_std", "bonus"):
-            if not 0 <= getattr(self, name) < math.inf:
+            if not 0 <= (getattr(self, name) or 0) < math.inf:
                 raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
         if not 0 <= self.epsilon <= 1:
             raise ValueError(f"epsilon must lie between 0 and 1, got {self.epsilon}")
@@ -107,7 +107,7 @@ class BehaviourPolicy(TensorDictModuleBase):
         """Set what changes as learning goes on, for a share of the training that is over, 0 to 1."""
         if isinstance(self.policy, GreedyPolicy):
             first, last = self.behaviour.std, self.behaviour.final_std
-            self.policy.std = first + share * (last - first)
+            self.policy.std = first if last is None else first + share * (last - first)
         elif isinstance(self.policy, GibbsPolicy):
             self.policy.anneal(share)
 

@@ -97,6 +97,15 @@ def test_copies_for_other_processes_ask_a_critic_of_their_own(scheme):
     assert other.noise.state()["generators"].ne(original.noise.state()["generators"]).any()
 
 
+def test_the_reach_of_guidance_may_follow_the_critics_variance():
+    near, far = states(), states()
+    far["observation"] = far["observation"] + 50
+    guided = policy("gibbs", gibbs_width=None, noise_scale=0.5, most_std=0.6)
+    widths = [guided.policy(data)["gibbs", "width"] for data in (near, far)]
+    assert (widths[0] < widths[1]).all()
+    torch.testing.assert_close(widths[1], torch.full_like(widths[1], 0.6 * 1.5))  # halves of a range of 3
+
+
 def test_noise_and_guidance_change_as_learning_goes_on():
     gaussian = policy("gaussian", std=0.5, final_std=0.1)
     spreads = []
@@ -118,6 +127,8 @@ def test_noise_and_guidance_change_as_learning_goes_on():
         ({"exploration": "random"}, "exploration must be one of gaussian, confidence"),
         ({"std": -0.1}, "std must be at least 0"),
         ({"epsilon": 1.5}, "epsilon must lie between 0 and 1"),
+        ({"least_std": 2.0}, "floor ≤ ceiling"),
+        ({"inverse_temperature": 0.0}, "inverse temperatures must be positive"),
     ],
 )
 def test_numbers_out_of_range_are_refused(options, message, monkeypatch):

@@ -14,7 +14,7 @@ All begin with actions uniform in their box, until the critic has been taught.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -26,7 +26,8 @@ from torch import Tensor
 from torch_gprl.critics.maximise import ActionMaximiser
 from torch_gprl.policies.confidence_noise import ConfidenceNoise, ConfidenceScale
 from torch_gprl.policies.gaussian import explores
-from torch_gprl.policies.gibbs import GibbsConfig, GibbsPolicy
+from torch_gprl.policies.gibbs import GibbsConfig, GibbsPolicy, Sampler
+from torch_gprl.policies.gibbs_energy import EnergyForm
 from torch_gprl.policies.greedy import GreedyPolicy
 from torch_gprl.policies.optimistic import ThompsonSampling, UpperConfidence
 from torch_gprl.policies.streams import NoiseStream
@@ -44,12 +45,18 @@ class Behaviour:
     """
 
     exploration: Scheme = "gaussian"  # of the action round the greedy one; torch_gprl.policies.behaviour
-    std: float = 0.3  # of the gaussian noise at first, in halves of the actuator's range
-    final_std: float | None = None  # of the gaussian noise at last, in equal steps; as at first unless told
+    std: float = 0.3  # gaussian: standard deviation at first, in halves of the actuator's range
+    final_std: float | None = None  # gaussian: the same at last, in equal steps; as at first unless told
     epsilon: float = 0.0  # gaussian: probability of an action uniform in the box
+    noise_scale: float = 1.0  # confidence: σ² in squared halves of the range, for one target variance
+    least_std: float = 0.05  # confidence: floor of σ, in halves of the actuator's range
+    most_std: float = 1.0  # confidence: ceiling of σ, in halves of the actuator's range
+    gibbs_form: EnergyForm = "robust"  # gibbs: the thesis' energy, or its sibling that stays near f(s)
+    inverse_temperature: float = 3.0  # gibbs: β at first, for values scaled by their range over the actions
+    final_inverse_temperature: float = 30.0  # gibbs: β at last; it grows by equal factors
+    gibbs_width: float | None = 0.5  # gibbs: σ_e, in halves of the range; by the critic's variance if none
+    gibbs_sampler: Sampler = "candidates"  # gibbs: who draws more than one action dimension
     bonus: float = 1.0  # upper: standard deviations of the value added to its mean
-    confidence: ConfidenceScale = field(default_factory=ConfidenceScale)
-    gibbs: GibbsConfig = field(default_factory=GibbsConfig)
 
     def __post_init__(self) -> None:
         """Refuse what is no behaviour."""
@@ -61,6 +68,23 @@ class Behaviour:
                 raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
         if not 0 <= self.epsilon <= 1:
             raise ValueError(f"epsilon must lie between 0 and 1, got {self.epsilon}")
+        _ = self.confidence, self.gibbs  # each checks its own numbers
+
+    @property
+    def confidence(self) -> ConfidenceScale:
+        """The numbers of confidence noise."""
+        return ConfidenceScale(self.noise_scale, self.least_std, self.most_std)
+
+    @property
+    def gibbs(self) -> GibbsConfig:
+        """The numbers of Gibbs exploration."""
+        return GibbsConfig(
+            self.gibbs_form,
+            self.inverse_temperature,
+            self.final_inverse_temperature,
+            GibbsConfig.width if self.gibbs_width is None else self.gibbs_width,
+            sampler=self.gibbs_sampler,
+        )
 
 
 class BehaviourPolicy(TensorDictModuleBase):
@@ -145,7 +169,8 @@ def _explorer(
     if behaviour.exploration == "confidence":
         return ConfidenceNoise(greedy, critic, behaviour.confidence, NoiseStream(seed, learners))
     if behaviour.exploration == "gibbs":
-        return GibbsPolicy(greedy, critic, behaviour.gibbs, NoiseStream(seed, learners))
+        width = behaviour.confidence if behaviour.gibbs_width is None else None
+        return GibbsPolicy(greedy, critic, behaviour.gibbs, NoiseStream(seed, learners), width)
     if behaviour.exploration == "thompson":
         return ThompsonSampling(maximiser, seed, learners)
     if behaviour.exploration == "upper":

@@ -66,10 +66,11 @@ def foresee(
             alive.append(running.clone())
             running &= ~step["next", "done"].squeeze(-1)
         past = TensorDict.maybe_dense_stack(seen, -1)  # [learners, num_envs, T]
-        last = past.get("next").select("observation")
-        acted = policy(last.reshape(last.shape[0], -1)).get("action").unflatten(1, last.shape[1:])
+        reached = past.get(("next", "observation"))
+        ahead = TensorDict({"observation": reached.flatten(1, 2)}, (len(reached), reached[0, ..., 0].numel()))
+        acted = policy(ahead).get("action").unflatten(1, reached.shape[1:3])
         mean, variance = _values(critic, past.get("observation"), past.get("action"), learner)
-        beyond, _ = _values(critic, last.get("observation"), acted, learner)
+        beyond, _ = _values(critic, reached, acted, learner)
     reward, done, terminated = (
         past.get(("next", name))[learner].squeeze(-1) for name in ("reward", "done", "terminated")
     )

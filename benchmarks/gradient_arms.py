@@ -9,7 +9,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.gradient_data import STEPS, Batches
-from benchmarks.neural_value import NeuralValue
 from torch_gprl.critics import (
     ESTIMATORS,
     USE_ALL_ACTIONS,
@@ -20,13 +19,19 @@ from torch_gprl.critics import (
 )
 from torch_gprl.learners import PolicyGradientConfig
 from torch_gprl.learners.config import Targets
+from torch_gprl.learners.neural_value import NeuralTeacher, NeuralValue
 from torch_gprl.learners.teaching import Teacher, make_critic
 from torch_gprl.objectives import AllActionLoss, PolicyGradientLoss
 
 
 @dataclass(frozen=True)
 class Arm:
-    """An estimator, and the critic behind it: "none", "returns" and "differences" (GP), or "neural"."""
+    """An estimator, and the critic behind it.
+
+    Critics are "none", "neural", and Gaussian processes: "returns" and "differences" learned one earlier
+    batch, "replay" the differences of several, and "pooled" those of so many that next to nothing is unknown.
+    What the last one leaves is the noise of the few states in a batch, which no critic can help.
+    """
 
     label: str
     critic: str
@@ -54,7 +59,12 @@ ARMS = (
     Arm("GPTD, k = 1, minus V", "differences", "k-step-baseline", 1),
     Arm("GPTD advantage", "differences", "advantage"),
     Arm("GPTD all-action", "differences", "all-action"),
+    Arm("GPTD GAE, λ = 0.8, replay", "replay", "generalised", trace=0.8),
+    Arm("GPTD all-action, replay", "replay", "all-action"),
+    Arm("all-action, best critic", "pooled", "all-action"),
 )
+REPLAYED, POOLED = 5, 40  # batches
+POOLED_BUDGET, POOLED_NOISE = 600, 0.01
 
 
 class Critics(NamedTuple):
@@ -64,10 +74,37 @@ class Critics(NamedTuple):
     neural: NeuralValue
 
 
-def fit_critics(earlier: Batches, numbers: PolicyGradientConfig) -> Critics:
-    """All critics, fitted on one earlier batch for each learner."""
-    gaussian = {targets: fit_gaussian(earlier, numbers, targets) for targets in ("returns", "differences")}
-    return Critics(gaussian, NeuralValue(earlier, numbers.discount))
+def fit_critics(
+    earlier: Batches, several: Batches, pooled: GPActionValue, numbers: PolicyGradientConfig
+) -> Critics:
+    """All critics: fitted on one earlier batch for each learner, on several, and the one that serves all."""
+    gaussian = {
+        "returns": fit_gaussian(earlier, numbers, "returns"),
+        "differences": fit_gaussian(earlier, numbers, "differences"),
+        "replay": fit_gaussian(several, numbers, "differences"),
+        "pooled": pooled,
+    }
+    return Critics(gaussian, fit_neural(earlier, numbers))
+
+
+def fit_neural(earlier: Batches, numbers: PolicyGradientConfig) -> NeuralValue:
+    """A neural state value, taught as the learner teaches it; twice, to bootstrap where episodes are cut."""
+    data, critic = earlier.data.clone(), NeuralValue(earlier.data["observation"].shape[-1], len(earlier.data))
+    teacher = NeuralTeacher(critic)
+    estimator = GPValueEstimator(critic, earlier.policy, numbers.discount, "generalised", STEPS)
+    for round_ in range(2):
+        teacher.teach(estimator(data), round_)
+    return critic.requires_grad_(False)
+
+
+def fit_pooled(batch: Batches, numbers: PolicyGradientConfig, learners: int) -> GPActionValue:
+    """One critic that has learned a very large batch of one learner, repeated for all learners."""
+    config = dataclasses.replace(numbers, targets="differences", budget=POOLED_BUDGET, noise=POOLED_NOISE)
+    one = fit_gaussian(batch, config, "differences")
+    critic = make_critic(batch.policy, config, learners)
+    own = critic.state_dict()
+    critic.load_state_dict({key: value.expand_as(own[key]) for key, value in one.state_dict().items()})
+    return critic.requires_grad_(False)
 
 
 def fit_gaussian(earlier: Batches, numbers: PolicyGradientConfig, targets: Targets) -> GPActionValue:
@@ -87,8 +124,7 @@ def evaluations(new: Batches, critics: Critics, discount: float) -> dict[str, Ev
     }
     nothing = torch.zeros_like(new.true_return)
     seen["none"] = dataclasses.replace(seen["returns"], taken=nothing, value=nothing, next_value=nothing)
-    value, following = (critics.neural(part["observation"]) for part in (new.data, new.data["next"]))
-    seen["neural"] = dataclasses.replace(seen["none"], value=value, next_value=following)
+    seen["neural"] = GPValueEstimator(critics.neural, new.policy, discount).evaluate(new.data)
     return seen
 
 

@@ -135,11 +135,11 @@ class Batches:
     policy: GaussianPolicy
 
 
-def batches(fixed: Fixed, learners: int, seed: int) -> Batches:
+def batches(fixed: Fixed, learners: int, seed: int, episodes: int = EPISODES) -> Batches:
     """Independent batches of a policy, as many as `learners`."""
     length, discount = STEPS + TAIL, fixed.setting.discount
     env = envs.make(
-        fixed.setting.task, learners=learners, num_envs=EPISODES, seed=seed, threads=1, horizon=length + 1
+        fixed.setting.task, learners=learners, num_envs=episodes, seed=seed, threads=1, horizon=length + 1
     )
     policy = fixed.policy(learners, seed, env)
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):

@@ -3,8 +3,8 @@
     python -m benchmarks.gradient_quality [--quick] [--batches 200] [--task Pendulum-v1]
 
 At fixed policies, every estimator sees the same independent batches of 5 episodes of 200 steps; its critic
-was fitted on one earlier batch. The reference is the mean over many more batches, of true returns less a
-baseline.
+was fitted on one earlier batch, or on five ("replay"). The reference is the mean over many more batches of an
+unbiased estimator on true returns.
 Leaves gradient_quality.json and gradient_quality.png in --out.
 """
 
@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 import tyro
@@ -23,19 +24,23 @@ from torch import Tensor
 
 from benchmarks.gradient_arms import (
     ARMS,
+    POOLED,
+    REPLAYED,
     Quality,
     ascent,
     evaluations,
     fit_critics,
-    fit_gaussian,
+    fit_pooled,
     gradients,
     quality,
 )
 from benchmarks.gradient_data import EPISODES, SETTINGS, STEPS, Fixed, batches, fixed_policies
-from torch_gprl.critics import GPValueEstimator
+from benchmarks.gradient_truth import branches
+from torch_gprl.critics import GPActionValue
 from torch_gprl.learners import PolicyGradientConfig
 
-SIDE_BY_SIDE = 40  # batches, as learners of one program
+SIDE_BY_SIDE = 40  # batches, as learners of one program; all counts of batches are rounded up to it
+POOLED_SEED, BRANCHES_SEED = 2_000_000, 3_000_000
 FIGURES = {
     "nsr": "noise: tr Cov / ‖mean‖²",
     "cos_mean": "cosine of the mean",
@@ -49,7 +54,7 @@ class Options:
 
     quick: bool = False  # 40 batches on the first task alone: shows that it works, not how good it is
     batches: int = 200  # independent batches of every policy
-    reference_batches: int = 800  # further ones, for the reference gradient
+    reference_batches: int = 400  # further ones, for the reference gradient
     task: str | None = None  # one task instead of all
     budget: int = 300  # basis vectors of the critics
     out: Path = field(default_factory=lambda: Path("runs/gradient-quality"))  # where results and policies go
@@ -70,7 +75,7 @@ def main(options: Options) -> None:
     if not settings:
         known = ", ".join(setting.task for setting in SETTINGS)
         raise SystemExit(f"no comparison on task '{options.task}'; choose one of {known}")
-    results: dict[str, dict[str, Quality]] = {}
+    results: dict[str, Comparison] = {}
     for setting in settings:
         for fixed in fixed_policies(setting, options.out / "policies"):
             title = f"{setting.task}, {fixed.name} policy (return {fixed.mean_return:.0f})"
@@ -79,62 +84,83 @@ def main(options: Options) -> None:
     write(results, options.out)
 
 
-def compare(fixed: Fixed, options: Options) -> dict[str, Quality]:
+class Comparison(NamedTuple):
+    """Figures of all estimators at one policy; correlation of each critic's advantages with the true ones."""
+
+    estimators: dict[str, Quality]
+    advantages: dict[str, float]
+
+
+def compare(fixed: Fixed, options: Options) -> Comparison:
     """Every estimator at one policy."""
     started, discount = time.monotonic(), fixed.setting.discount
     numbers = PolicyGradientConfig(budget=options.budget, discount=discount)
-    reference = reference_gradient(fixed, options, numbers)
+    pooled = fit_pooled(batches(fixed, 1, POOLED_SEED, POOLED * EPISODES), numbers, SIDE_BY_SIDE)
+    reference = reference_gradient(fixed, options, pooled)
+    truth = branches(fixed, BRANCHES_SEED)
     found: dict[str, list[Tensor]] = {arm.label: [] for arm in ARMS}
-    for count, seed in _parts(options.batches, 0):
-        critics = fit_critics(batches(fixed, count, seed), numbers)
-        new = batches(fixed, count, seed + 1)
+    advantages: dict[str, list[Tensor]] = {}
+    for seed in _seeds(options.batches, 0):
+        earlier = batches(fixed, SIDE_BY_SIDE, seed)
+        several = batches(fixed, SIDE_BY_SIDE, seed + 2, REPLAYED * EPISODES)
+        critics = fit_critics(earlier, several, pooled, numbers)
+        new = batches(fixed, SIDE_BY_SIDE, seed + 1)
         seen = evaluations(new, critics, discount)
         for arm in ARMS:
             found[arm.label].append(gradients(arm, new, critics, seen))
+        for name, critic in critics.gaussian.items():
+            advantages.setdefault(name, []).append(truth.correlation(critic))
     print(f"{options.batches} batches in {time.monotonic() - started:.0f} s", flush=True)
-    return {label: quality(torch.cat(parts), reference) for label, parts in found.items()}
+    return Comparison(
+        {label: quality(torch.cat(parts), reference) for label, parts in found.items()},
+        {name: float(torch.cat(parts).mean()) for name, parts in advantages.items()},
+    )
 
 
-def reference_gradient(fixed: Fixed, options: Options, numbers: PolicyGradientConfig) -> Float[Tensor, " P"]:
-    """Mean over many batches of true returns, less the value of a critic fitted on other batches."""
+def reference_gradient(fixed: Fixed, options: Options, pooled: GPActionValue) -> Float[Tensor, " P"]:
+    """Mean over many batches of true returns, less a critic's Q and with its all-action term: unbiased."""
     parts = []
-    config = dataclasses.replace(numbers, budget=150)  # any baseline is unbiased
-    for count, seed in _parts(options.reference_batches, 1_000_000):
-        critic = fit_gaussian(batches(fixed, count, seed), config, "differences")
-        new = batches(fixed, count, seed + 1)
-        seen = GPValueEstimator(critic, new.policy, config.discount).evaluate(new.data)
-        parts.append(ascent(new, new.true_return - seen.value))
+    for seed in _seeds(options.reference_batches, 1_000_000):
+        new = batches(fixed, SIDE_BY_SIDE, seed)
+        with torch.no_grad():
+            taken = pooled.mean_value(new.data["observation"], new.data["action"])
+        parts.append(ascent(new, new.true_return - taken, pooled))
     return torch.cat(parts).mean(0)
 
 
-def _parts(total: int, first_seed: int) -> Iterator[tuple[int, int]]:
-    """How many batches run side by side, and a seed, until all are done."""
-    for done in range(0, total, SIDE_BY_SIDE):
-        yield min(SIDE_BY_SIDE, total - done), first_seed + 10_000 * (done // SIDE_BY_SIDE)
+def _seeds(total: int, first: int) -> Iterator[int]:
+    """A seed for every group of batches that run side by side."""
+    for group in range(-(-total // SIDE_BY_SIDE)):
+        yield first + 10_000 * group
 
 
-def show(title: str, results: dict[str, Quality]) -> None:
+def show(title: str, results: Comparison) -> None:
     """Print the table of one policy."""
     print(f"\n{title}: batches of {EPISODES} × {STEPS} steps\n")
     print(f"| {'estimator':26s} | nsr (95 % interval)      | cosM | cosB | relMSE  |")
     print(f"|{'-' * 28}|--------------------------|------|------|---------|")
-    for label, found in results.items():
+    for label, found in results.estimators.items():
         value, low, high = found.nsr.tolist()
         noise = f"{value:8.3g} ({low:.3g} to {high:.3g})"
         rest = f"{found.cos_mean[0]:.2f} | {found.cos_batch[0]:.2f} | {found.relative_mse[0]:7.3g}"
         print(f"| {label:26s} | {noise:24s} | {rest} |")
+    correlations = ", ".join(f"{name} {value:.2f}" for name, value in results.advantages.items())
+    print(f"\ncorrelation of estimated and true advantage, by critic: {correlations}", flush=True)
 
 
-def write(results: dict[str, dict[str, Quality]], out: Path) -> None:
+def write(results: dict[str, Comparison], out: Path) -> None:
     """Leave the figures with their intervals as JSON, and a picture."""
     out.mkdir(parents=True, exist_ok=True)
     plain = {
         title: {
-            label: {
-                name: dict(zip(("value", "low", "high"), t.tolist(), strict=True))
-                for name, t in q._asdict().items()
-            }
-            for label, q in table.items()
+            "advantage correlation": table.advantages,
+            "estimators": {
+                label: {
+                    name: dict(zip(("value", "low", "high"), t.tolist(), strict=True))
+                    for name, t in q._asdict().items()
+                }
+                for label, q in table.estimators.items()
+            },
         }
         for title, table in results.items()
     }
@@ -143,11 +169,12 @@ def write(results: dict[str, dict[str, Quality]], out: Path) -> None:
     print(f"\nfigures and picture are in {out}")
 
 
-def draw(results: dict[str, dict[str, Quality]]) -> Figure:
+def draw(results: dict[str, Comparison]) -> Figure:
     """One row of panels for each policy: noise, bias, and what a single batch is worth."""
     figure = Figure(figsize=(11, 4.2 * len(results)), layout="constrained")
     panels = figure.subplots(len(results), len(FIGURES), squeeze=False, sharey=True)
-    for row, (title, table) in zip(panels, results.items(), strict=True):
+    for row, (title, comparison) in zip(panels, results.items(), strict=True):
+        table = comparison.estimators
         for axes, (name, meaning) in zip(row, FIGURES.items(), strict=True):
             figures = torch.stack([getattr(found, name) for found in table.values()])
             value, low, high = (column.numpy() for column in figures.unbind(1))

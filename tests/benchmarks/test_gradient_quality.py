@@ -5,9 +5,13 @@ from typing import get_args
 import pytest
 import torch
 
-from benchmarks.gradient_arms import ARMS, evaluations, fit_critics, gradients, quality
+import envs
+from benchmarks.gradient_arms import ARMS, evaluations, fit_critics, fit_pooled, gradients, quality
 from benchmarks.gradient_data import EPISODES, SETTINGS, STEPS, Batches, Fixed, batches
-from torch_gprl.critics import EstimatorName
+from benchmarks.gradient_truth import ACTIONS, STATES, Branches, branches
+from torch_gprl.critics import EstimatorName, GPActionValue
+from torch_gprl.gp import SparseOnlineGP
+from torch_gprl.kernels import SquaredExponential
 from torch_gprl.learners import PolicyGradientConfig
 from torch_gprl.policies import RBFController
 
@@ -17,13 +21,13 @@ NUMBERS = PolicyGradientConfig(budget=30, discount=SETTINGS[0].discount)
 
 def test_figures_are_those_of_the_distribution():
     mean, spread = torch.tensor([3.0, 4.0]).double(), torch.tensor([1.0, 2.0]).double()
-    drawn = mean + spread * torch.randn(20_000, 2, dtype=torch.float64)
+    drawn = mean + spread * torch.randn(4_000, 2, dtype=torch.float64)
     reference = torch.tensor([5.0, 0.0]).double()
     found = quality(drawn, reference)
     expected = {"nsr": 5 / 25, "cos_mean": 3 / 5, "relative_mse": (5 + 4 + 16) / 25}
     for name, value in expected.items():
         centre, low, high = getattr(found, name).tolist()
-        assert centre == pytest.approx(value, rel=0.03)
+        assert centre == pytest.approx(value, rel=0.06)
         assert low < centre < high
 
 
@@ -34,12 +38,19 @@ def test_a_constant_estimate_has_no_noise():
     torch.testing.assert_close(found.cos_batch, torch.full((3,), 0.5**0.5).double())
 
 
+def untrained() -> Fixed:
+    return Fixed(SETTINGS[0], "mid", RBFController(3, 1, seed=3).state_dict(), 0.0)
+
+
+def pendulums(learners: int) -> envs.BatchEnv:
+    return envs.make(SETTINGS[0].task, learners=learners, num_envs=1, threads=1)
+
+
 @pytest.fixture(scope="module")
 def made() -> tuple[Batches, Batches]:
     """Two batches of an untrained pendulum controller for each learner."""
     torch.manual_seed(0)
-    fixed = Fixed(SETTINGS[0], "mid", RBFController(3, 1, seed=3).state_dict(), 0.0)
-    return batches(fixed, LEARNERS, 0), batches(fixed, LEARNERS, 1)
+    return batches(untrained(), LEARNERS, 0), batches(untrained(), LEARNERS, 1)
 
 
 def test_the_true_return_counts_rewards_behind_the_cut(made):
@@ -55,7 +66,9 @@ def test_the_true_return_counts_rewards_behind_the_cut(made):
 
 def test_every_arm_gives_a_gradient_for_every_batch(made):
     earlier, new = made
-    critics = fit_critics(earlier, NUMBERS)
+    one = Batches(earlier.data[:1], earlier.true_return[:1], untrained().policy(1, 0, pendulums(1)))
+    pooled = fit_pooled(one, NUMBERS, LEARNERS)
+    critics = fit_critics(earlier, earlier, pooled, NUMBERS)
     seen = evaluations(new, critics, NUMBERS.discount)
     for arm in ARMS:
         found = gradients(arm, new, critics, seen)
@@ -66,3 +79,29 @@ def test_every_arm_gives_a_gradient_for_every_batch(made):
 def test_arms_cover_every_estimator_and_are_told_apart():
     assert {arm.estimator for arm in ARMS} == set(get_args(EstimatorName))
     assert len({arm.label for arm in ARMS}) == len(ARMS)
+
+
+class Known(GPActionValue):
+    """A critic whose advantages are those of the branches, times two, and whose values are another's."""
+
+    def __init__(self, truth: Branches) -> None:
+        super().__init__(SparseOnlineGP(SquaredExponential(4, batch_shape=(2,)), 10))
+        self.truth = truth
+
+    def mean_value(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        value = 100 * observation[..., :1].sum(-1)
+        return value + 2 * self.truth.mean_return
+
+
+def test_advantages_are_compared_within_states():
+    truth = branches(untrained(), 0)
+    torch.testing.assert_close(truth.correlation(Known(truth)), torch.ones(2).double())
+
+
+def test_branches_return_what_the_policy_returns(made):
+    truth, returns = branches(untrained(), 0), made[0].true_return
+    by_state = truth.mean_return.mean(1)
+    # 32 states, and the 15 episodes of the batches, whose steps hang together
+    error = (by_state.var() / STATES + returns.mean(-1).var() / (LEARNERS * EPISODES)).sqrt()
+    assert (by_state.mean() - returns.mean()).abs() < 4 * error
+    assert truth.action.shape == (STATES, ACTIONS, 1)

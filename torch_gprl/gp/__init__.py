@@ -2,6 +2,7 @@
 
 from torch_gprl.gp.evidence import fit_hyperparameters
 from torch_gprl.gp.exact import ExactGP
+from torch_gprl.gp.parallel import ParallelSparseGP, broadcast_state
 from torch_gprl.gp.posterior import Posterior
 from torch_gprl.gp.pruning import AgeAwareScore, BasisStatistics, InformationScore, PruningScore
 from torch_gprl.gp.recursion import RecursiveGP
@@ -13,11 +14,13 @@ __all__ = [
     "BasisStatistics",
     "ExactGP",
     "InformationScore",
+    "ParallelSparseGP",
     "PathSampler",
     "Paths",
     "Posterior",
     "PruningScore",
     "RecursiveGP",
     "SparseOnlineGP",
+    "broadcast_state",
     "fit_hyperparameters",
 ]

@@ -291,7 +291,7 @@ class SparseOnlineGP(WhitenedState):
         prior = self.kernel.diag(inputs) - 2 * discount * shared + discount.square() * own
         return difference, prior - torch.linalg.vecdot(difference, difference, dim=-2)
 
-    def _churn(self, mask: Tensor | None, points: int) -> Tensor:
+    def _churn(self, mask: Tensor | None, points: int | Tensor) -> Tensor:
         """Most additions to a full basis from the next block, of each learner."""
         if self.order == "arrival":
             return torch.ones_like(self.observations)

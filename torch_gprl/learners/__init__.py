@@ -1,8 +1,17 @@
 """Learners: each a loop that reads top to bottom."""
 
+from torch_gprl.learners.actor_critic import ActorCritic
+from torch_gprl.learners.actor_critic_config import ActorCriticConfig
 from torch_gprl.learners.config import PolicyGradientConfig
 from torch_gprl.learners.policy_gradient import PolicyGradient
 from torch_gprl.learners.q_learning import QLearning
 from torch_gprl.learners.q_learning_config import QLearningConfig
 
-__all__ = ["PolicyGradient", "PolicyGradientConfig", "QLearning", "QLearningConfig"]
+__all__ = [
+    "ActorCritic",
+    "ActorCriticConfig",
+    "PolicyGradient",
+    "PolicyGradientConfig",
+    "QLearning",
+    "QLearningConfig",
+]

@@ -1,0 +1,86 @@
+"""A sparse process on a prescribed basis, with all that it knows given at once.
+
+A stream grows its basis as it comes (`SparseOnlineGP.update`). Where all data are kept, the basis is better
+chosen among all of them, and the pseudo-likelihood of the basis values u is summed anew whenever targets
+change. Gonzalez (1985), "Clustering to minimize the maximum intercluster distance", for the choice; the
+state that is written is that of `whitened`.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torch_gprl.gp.sparse_online import SparseOnlineGP
+from torch_gprl.gp.whitened import solve_triangular
+
+LEAST_DISTANCE = 0.02  # length scales: nearer points say the same, and ruin the Gram matrix' condition
+
+
+@torch.no_grad()
+def adopt_basis(gp: SparseOnlineGP, inputs: Float[Tensor, "*batch N D"]) -> None:
+    """Forget everything, and make the basis of points that lie farthest from each other.
+
+    Args:
+        gp: process whose kernel has length scales; its whole budget is used if the points fill it.
+        inputs: points to choose from, [*batch, N, D].
+    """
+    scaled = inputs / gp.kernel.lengthscale.unsqueeze(-2)
+    index, size = farthest_points(scaled, min(gp.budget, inputs.shape[-2]))
+    rows = index.shape[-1]
+    gp.reset()
+    chosen = inputs.gather(-2, index.unsqueeze(-1).expand(*index.shape, inputs.shape[-1]))
+    gp.size.copy_(size)
+    gp.basis[..., :rows, :] = torch.where(gp.mask[..., :rows, None], chosen, 0.0)
+    gp.rebase()  # the Gram factor of the new basis; there is nothing else to keep
+
+
+def farthest_points(
+    points: Float[Tensor, "*batch N D"], count: int
+) -> tuple[Int[Tensor, "*batch M"], Int[Tensor, "*batch"]]:
+    """Indices of `count` points, the first and then always the one farthest from those before.
+
+    Returns:
+        the indices, and how many of them are farther than `LEAST_DISTANCE` from all before.
+    """
+    square = points.square().sum(-1)
+    nearest = torch.full_like(square, torch.inf)
+    index = torch.zeros(*square.shape[:-1], 1, dtype=torch.long, device=points.device)
+    picks, distinct = [], torch.ones_like(index[..., 0])
+    for pick in range(count):
+        picks.append(index)
+        point = points.gather(-2, index.unsqueeze(-1).expand(*index.shape, points.shape[-1]))
+        away = square - 2 * (points @ point.mT).squeeze(-1) + square.gather(-1, index)
+        nearest = torch.minimum(nearest, away)
+        farthest, index = nearest.max(-1, keepdim=True)
+        if pick + 1 < count:
+            distinct += (farthest.squeeze(-1) > LEAST_DISTANCE**2).long()
+    return torch.cat(picks, -1), distinct
+
+
+@torch.no_grad()
+def observe_anew(
+    gp: SparseOnlineGP, design: Float[Tensor, "*batch N R"], targets: Float[Tensor, "*batch N"]
+) -> None:
+    """Forget all data, and learn y = X α + noise, with X the design and α = K⁻¹u the weights of the basis.
+
+    The posterior mean is then k(x, X_B) α with the α that solves (XᵀX/σ0² + K) α = Xᵀy/σ0². What the basis
+    misses of an observation counts as explained (the form "dtc").
+
+    Args:
+        gp: process whose basis stays; the rows in use come first.
+        design: rows of X, one for each observation, for the first R basis vectors; zero where unused.
+        targets: y.
+    """
+    rows, noise = design.shape[-1], gp.noise_variance
+    factor = gp.gram_factor[..., :rows, :rows]
+    half = solve_triangular(factor, design.mT @ design)
+    gp.forget()
+    gp.precision[..., :rows, :rows] += solve_triangular(factor, half.mT) / noise[..., None, None]  # L⁻¹XᵀXL⁻ᵀ
+    information = solve_triangular(factor, design.mT @ targets.unsqueeze(-1)).squeeze(-1)
+    gp.information[..., :rows] = information / noise.unsqueeze(-1)
+    count = targets.shape[-1]
+    quadratic = targets.square().sum(-1) / noise
+    gp.evidence_constant.copy_(-0.5 * (quadratic + count * (2 * math.pi * noise).log()))
+    gp.observations.fill_(count)

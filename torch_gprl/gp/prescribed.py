@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torch_gprl.gp.sparse_online import SparseOnlineGP
 from torch_gprl.gp.whitened import solve_triangular
+from torch_gprl.kernels.stationary import Stationary
 
 LEAST_DISTANCE = 0.02  # length scales: nearer points say the same, and ruin the Gram matrix' condition
 
@@ -23,9 +24,10 @@ def adopt_basis(gp: SparseOnlineGP, inputs: Float[Tensor, "*batch N D"]) -> None
     """Forget everything, and make the basis of points that lie farthest from each other.
 
     Args:
-        gp: process whose kernel has length scales; its whole budget is used if the points fill it.
+        gp: process of a stationary kernel; its whole budget is used if the points fill it.
         inputs: points to choose from, [*batch, N, D].
     """
+    assert isinstance(gp.kernel, Stationary)
     scaled = inputs / gp.kernel.lengthscale.unsqueeze(-2)
     index, size = farthest_points(scaled, min(gp.budget, inputs.shape[-2]))
     rows = index.shape[-1]

@@ -3,15 +3,7 @@
 import math
 from dataclasses import dataclass
 
-LEAST = {
-    "total_frames": 1,
-    "rollout_steps": 1,
-    "budget": 1,
-    "sweeps": 1,
-    "fit_steps": 1,
-    "batch": 1,
-    "hidden": 1,
-}
+LEAST_ONE = ("total_frames", "rollout_steps", "budget", "sweeps", "fit_steps", "batch", "hidden")
 POSITIVE = ("std", "amplitude", "noise", "lengthscale", "action_lengthscale", "trust_region", "learning_rate")
 SHARES = ("discount", "growth")
 
@@ -47,9 +39,9 @@ class ActorCriticConfig:
         Raises:
             ValueError: naming the field, its value and what would be valid.
         """
-        for name, least in LEAST.items():
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        for name in LEAST_ONE:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         for name in POSITIVE:
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")

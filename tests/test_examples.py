@@ -43,6 +43,14 @@ def test_ten_lines_train_an_environment_of_ones_own(capsys):
 
 
 @pytest.mark.slow
+def test_several_processes_train_one_learner(tmp_path):
+    learner = load("several_processes").train(tmp_path / "learner.pt", updates=2, copies=1)
+    saved = torch.load(tmp_path / "learner.pt", weights_only=True)
+    assert saved["updates"] == learner.updates == 2
+    assert learner.frames == 2 * 2 * 200
+
+
+@pytest.mark.slow
 def test_ppo_with_the_process_swings_the_pendulum_up():
     returns = load("ppo").train()
     assert max(returns[:3]) < -800

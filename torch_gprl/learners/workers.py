@@ -39,9 +39,10 @@ class WorkerCollection:
     Asynchronous ones make whole rollouts in turn while the learner learns: a rollout may have been begun
     under an older policy. Workers take up a new policy between two steps.
 
-    Their environments are not saved, a resumed run begins new episodes. Every worker has random numbers of
-    its own, drawn from the policy's streams: a run repeats itself if it is synchronous and keeps its number
-    of workers. Scripts that use workers need the guard `if __name__ == "__main__"`.
+    What travels are parameters and buffers; what a policy keeps elsewhere stays as it was at the start.
+    Environments of workers are not saved, a resumed run begins new episodes. Every worker has random numbers
+    of its own, drawn from the policy's streams: a run repeats itself if it is synchronous and keeps its
+    number of workers. Scripts that use workers need the guard `if __name__ == "__main__"`.
 
     Args:
         factories: one for each worker, makes its environment of batch [learners, envs of this worker].
@@ -217,11 +218,11 @@ class ReportingCollector(Collector):
 def copied_for_workers(modules: nn.ModuleDict, count: int) -> list[nn.ModuleDict]:
     """Copies of policy and critic that see each other as the originals do, with noise of their own."""
     copies = [copy.deepcopy(modules) for _ in range(count)]
-    for originals in zip(modules.modules(), *(one.modules() for one in copies), strict=True):
-        noise = getattr(originals[0], "noise", None)
-        if isinstance(noise, NoiseStream):
-            for module, own in zip(originals[1:], noise.split(count), strict=True):
-                module.noise = own
+    for original, *parts in zip(modules.modules(), *(one.modules() for one in copies), strict=True):
+        streams = [(name, value) for name, value in vars(original).items() if isinstance(value, NoiseStream)]
+        for name, stream in streams:
+            for part, own in zip(parts, stream.split(count), strict=True):
+                setattr(part, name, own)
     return copies
 
 

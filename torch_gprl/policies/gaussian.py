@@ -147,14 +147,19 @@ def gaussian_policy(
     """
     if not std > 0:
         raise ValueError(f"std must be positive (in units of half the actuator's range), got {std}")
-    low, high = _bounds(action_spec, controller.action_dim)
+    low, high = action_bounds(action_spec, controller.action_dim)
     count = controller.batch_shape[0] if controller.batch_shape else 1
     indices = range(count) if learners is None else learners
     noise = None if seed is None else NoiseStream(seed, indices)
     return GaussianPolicy(GaussianHead(controller, low, high, std, observation_key), noise)
 
 
-def _bounds(action_spec: TensorSpec, dims: int) -> tuple[Tensor, Tensor]:
+def action_bounds(action_spec: TensorSpec, dims: int) -> tuple[Float[Tensor, " A"], Float[Tensor, " A"]]:
+    """Lower and upper bounds of a spec whose last dimension is the action, of `dims` entries.
+
+    Raises:
+        ValueError: a spec without finite bounds.
+    """
     space = action_spec.space
     if not isinstance(space, ContinuousBox) or not bool(torch.isfinite(space.high - space.low).all()):
         raise ValueError(f"the action spec must be bounded on both sides, got {action_spec}")

@@ -30,7 +30,14 @@ from torchrl import logger as torchrl_logger
 
 import envs
 from torch_gprl.critics import GPActionValue
-from torch_gprl.learners import PolicyGradient, PolicyGradientConfig, QLearning, QLearningConfig
+from torch_gprl.learners import (
+    ActorCritic,
+    ActorCriticConfig,
+    PolicyGradient,
+    PolicyGradientConfig,
+    QLearning,
+    QLearningConfig,
+)
 from torch_gprl.runs import (
     Algorithm,
     Checkpoints,
@@ -102,8 +109,16 @@ class PolicyGradientOptions:
 class QLearningOptions:
     """Learn action values by a Gaussian process, and act greedily on them."""
 
-    run: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
+    run: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=lambda: RunOptions(num_envs=1))
     algorithm: tyro.conf.OmitArgPrefixes[QLearningConfig] = field(default_factory=QLearningConfig)
+
+
+@dataclass(frozen=True)
+class ActorCriticOptions:
+    """Follow the slopes of a Gaussian-process critic that solves all experience anew: fewest steps."""
+
+    run: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=lambda: RunOptions(num_envs=1))
+    algorithm: tyro.conf.OmitArgPrefixes[ActorCriticConfig] = field(default_factory=ActorCriticConfig)
 
 
 # A rollout holds whole episodes, and values look ahead as far as the task's steps are short.
@@ -114,11 +129,12 @@ POLICY_GRADIENT_PRESETS: dict[str, dict[str, object]] = {
     "InvertedPendulum-v5": {"rollout_steps": 1000, "discount": 0.99},
     "HalfCheetah-v5": {"rollout_steps": 1000, "total_frames": 1_000_000, "discount": 0.99},
 }
-Options = PolicyGradientOptions | QLearningOptions
-Learner = PolicyGradient | QLearning
+Options = PolicyGradientOptions | QLearningOptions | ActorCriticOptions
+Learner = PolicyGradient | QLearning | ActorCritic
 ALGORITHMS = {
     "policy-gradient": Algorithm(PolicyGradientOptions, PolicyGradient, POLICY_GRADIENT_PRESETS),
     "q-learning": Algorithm(QLearningOptions, QLearning),
+    "actor-critic": Algorithm(ActorCriticOptions, ActorCritic),
 }
 
 
@@ -376,12 +392,16 @@ def render(options: RenderOptions) -> None:
 
 def plot(options: PlotOptions) -> None:
     """Draw the learning curves of several runs into one picture."""
+    if not options.folders:
+        raise UserError("plot needs the folder of a run, or of several")
     curves = {}
+    names = [path.name for path in options.folders]
     for path in options.folders:
         recorded = read_metrics(RunFolder.opened(path).metrics)
         if options.metric not in recorded:
             raise UserError(f"{path} has no metric '{options.metric}'; choose one of {', '.join(recorded)}")
-        curves[path.name] = recorded["frames"][:, 0], recorded[options.metric]
+        name = path.name if names.count(path.name) == 1 else str(path)
+        curves[name] = recorded["frames"][:, 0], recorded[options.metric]
     save_figure(compare_curves(curves, options.metric), options.out)
     print(options.out)
 

@@ -2,7 +2,9 @@
 
 import csv
 import dataclasses
+import importlib.util
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,11 +13,14 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import matplotlib.image
+import numpy as np
 import pytest
+import torch
 import yaml
 
+import envs
 import train
-from torch_gprl.runs import Checkpoints
+from torch_gprl.runs import Checkpoints, read_metrics
 
 ROOT = Path(__file__).parents[1]
 TINY = ["--learners", "2", "--num-envs", "2", "--budget", "20", "--evaluation-episodes", "2"]
@@ -206,3 +211,160 @@ def test_no_argument_means_policy_gradient_on_the_swing_up():
 def test_options_reach_run_and_algorithm():
     _, options = train.parse(["policy-gradient", "--learners", "3", "--budget", "17", "--out", "there"])
     assert (options.run.learners, options.algorithm.budget, options.run.out) == (3, 17, Path("there"))
+
+
+# ---------------------------------------------------------------- commands on a finished run
+
+
+def test_evaluate_finds_again_what_the_run_found(tiny_run, capsys):
+    code = train.main(["evaluate", str(tiny_run.folder), "--episodes", "2"])
+    *learners, result = capsys.readouterr().out.splitlines()
+    assert code == 0
+    assert [line.split(":")[0] for line in learners] == ["learner 0", "learner 1"]
+    assert result == f"after update 2: {tiny_run.output.splitlines()[1]}"
+
+
+def test_evaluate_can_look_at_an_earlier_checkpoint(tiny_run, capsys):
+    train.main(["evaluate", str(tiny_run.folder), "--episodes", "1", "--checkpoint", "1"])
+    assert capsys.readouterr().out.splitlines()[-1].startswith("after update 1: final return ")
+
+
+def test_render_films_the_learner_asked_for(tiny_run, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(train, "LONGEST_FILM", 2)
+    film = tmp_path / "film.mp4"
+    assert train.main(["render", str(tiny_run.folder), "--learner", "1", "--out", str(film)]) == 0
+    assert film.stat().st_size > 500
+    assert capsys.readouterr().out.strip() == str(film)
+
+
+def test_plot_compares_runs(tiny_run, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(train, "compare_curves", lambda curves, label: drawn.append((curves, label)))
+    monkeypatch.setattr(train, "save_figure", lambda figure, path: drawn.append(path))
+    copy = shutil.copytree(tiny_run.folder, tmp_path / "again" / tiny_run.folder.name)
+    picture = str(tmp_path / "both.png")
+    train.main(["plot", str(tiny_run.folder), str(copy), "--metric", "sigma", "--out", picture])
+    (curves, label), path = drawn
+    assert list(curves) == [str(tiny_run.folder), str(copy)]  # the names alone would be the same
+    assert [list(frames) for frames, _ in curves.values()] == [[400, 800]] * 2
+    assert (label, path) == ("sigma", Path(picture))
+
+
+def test_tasks_are_listed_with_their_pictures(capsys):
+    assert train.main(["tasks"]) == 0
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(envs.ALL)
+    assert Path(last.removeprefix("pictures: ")).exists()
+
+
+def test_a_runs_config_repeats_its_options(tiny_run):
+    _, again = train.parse(["--config", str(tiny_run.folder / "config.yaml"), "--seed", "3"])
+    _, asked = train.parse(["policy-gradient", *TINY, "--total-frames", "800", "--out", str(tiny_run.folder)])
+    assert again == dataclasses.replace(asked, run=dataclasses.replace(asked.run, seed=3))
+
+
+@pytest.mark.parametrize("name", train.ALGORITHMS)
+def test_presets_are_options_of_tasks_that_exist(name):
+    for task, preset in train.ALGORITHMS[name].presets.items():
+        assert task in envs.ALL
+        options = train.parse([name, "--task", task])[1]
+        for option, value in preset.items():
+            assert value in (getattr(options.algorithm, option, None), getattr(options.run, option, None))
+
+
+RUN_MISTAKES = {
+    "evaluate {empty}": r"empty holds no run: there is no config\.yaml in it",
+    "--resume nowhere": r"nowhere holds no run",
+    "--resume {run} --checkpoint 7": r"there is no checkpoint 7 in .*; there are: 1, 2",
+    "render {run} --learner 2": r"learner must lie between 0 and 1, but is 2",
+    "plot {run} --metric retrun": r"has no metric 'retrun'; choose one of update, frames, ",
+    "plot": r"plot needs the folder of a run",
+    "--logger wandb": r"logger 'wandb' needs the package wandb",
+}
+
+
+@pytest.mark.parametrize("arguments", RUN_MISTAKES)
+def test_a_mistake_about_a_run_gets_one_line_and_exit_code_2(
+    arguments, tiny_run, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda package: None)
+    (tmp_path / "empty").mkdir()
+    code = train.main(arguments.format(run=tiny_run.folder, empty=tmp_path / "empty").split())
+    (line,) = capsys.readouterr().err.splitlines()
+    assert code == 2
+    assert re.search(RUN_MISTAKES[arguments], line)
+
+
+# ---------------------------------------------------------------- faults of environments
+
+
+SMALL = {
+    "policy-gradient": "--rollout-steps 20 --total-frames 240",
+    "q-learning": "--rollout-steps 10 --total-frames 120 --sweeps 3",
+    "actor-critic": "--rollout-steps 10 --total-frames 120 --first-frames 40 --batch 16",
+}
+SIZES = "--learners 2 --num-envs 2 --budget 15 --logger csv --checkpoint-interval 1000"
+
+
+def learned(name: str, folder: Path, task: str) -> int:
+    """The exit code of a small run that is neither evaluated nor drawn."""
+    sizes = f"{SIZES} {SMALL[name]}".split()
+    return train.main([name, *sizes, "--task", task, "--out", str(folder)])
+
+
+@pytest.fixture
+def task(monkeypatch):
+    """A pendulum that tests may break; training alone, as evaluation and pictures take longer."""
+    monkeypatch.setattr(train, "conclude", lambda *finished: None)
+    kind = type(envs.ALL["pendulum-swingup"])
+
+    class Fragile(kind):
+        bad_from, constant, ends = 10**9, False, False
+        steps = 0
+
+        def reward(self, before, action, after):
+            Fragile.steps += 1
+            whole = super().reward(before, action, after)
+            if Fragile.steps >= Fragile.bad_from:
+                return whole._replace(total=whole.total * float("nan"))
+            return whole._replace(total=torch.ones_like(whole.total)) if Fragile.constant else whole
+
+        def terminated(self, state):
+            return super().terminated(state) | Fragile.ends
+
+    whole = envs.ALL["pendulum-swingup"]
+    fields = {field.name: getattr(whole, field.name) for field in dataclasses.fields(whole)}
+    monkeypatch.setitem(envs.ALL, "fragile", Fragile(**{**fields, "id": "fragile"}))
+    return Fragile
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_broken_environment_ends_the_run_with_its_cause_and_a_checkpoint_to_go_on_from(
+    name, task, tmp_path, capsys
+):
+    assert learned(name, tmp_path / "whole", "fragile") == 0
+    task.steps, task.bad_from = 0, 50
+    assert learned(name, tmp_path / "broken", "fragile") == 1
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert re.search(
+        r"failed after update \d by FloatingPointError: the environment gave a reward that is not finite: .*"
+        r"--resume .*broken goes on from the last checkpoint",
+        line,
+    )
+    assert "Traceback" in (tmp_path / "broken" / "failure.txt").read_text(encoding="utf-8")
+
+    task.bad_from = 10**9
+    assert train.main(["--resume", str(tmp_path / "broken")]) == 0
+    written = [(tmp_path / run / "metrics.csv").read_bytes() for run in ("whole", "broken")]
+    assert written[0] == written[1]
+
+
+@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("oddity", ["constant", "ends"])
+def test_constant_rewards_and_episodes_of_one_step_are_no_faults(name, oddity, task, tmp_path):
+    setattr(task, oddity, True)
+    assert learned(name, tmp_path / "run", "fragile") == 0
+    metrics = read_metrics(tmp_path / "run" / "metrics.csv")
+    assert np.isfinite(metrics["basis_size"]).all()
+    if oddity == "ends":
+        assert np.isfinite(metrics["return"]).all()  # an episode ends at every step

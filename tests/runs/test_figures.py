@@ -6,7 +6,15 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from torch_gprl.runs import Surface, bootstrap_interval, learning_curve, save_figure, value_surface
+from torch_gprl.runs import (
+    Surface,
+    bootstrap_interval,
+    compare_curves,
+    learning_curve,
+    save_figure,
+    value_surface,
+)
+from torch_gprl.runs.figures import metric_panels
 
 FRAMES = np.array([100, 200, 300, 400])
 
@@ -102,3 +110,31 @@ def test_a_figure_becomes_a_file(tmp_path, ending):
     assert path.stat().st_size > 5000
     if ending == "png":
         assert matplotlib.image.imread(path).std() > 0.1
+
+
+def test_runs_are_compared_with_the_band_of_each():
+    few, many = returns(3), returns(20)
+    figure = compare_curves(
+        {"few": (FRAMES, few), "many": (FRAMES, many), "one": (FRAMES, few[:, :1])}, "sigma"
+    )
+    axes = figure.axes[0]
+    drawn = [line.get_ydata() for line in axes.get_lines()]
+    assert drawn == [pytest.approx(few.mean(1)), pytest.approx(many.mean(1)), pytest.approx(few[:, 0])]
+    edges = [patch.get_paths()[0].vertices[:, 1] for patch in axes.collections]
+    assert [edge.max() for edge in edges] == pytest.approx([few.max(), bootstrap_interval(many)[1].max()])
+    assert labels(figure) == [
+        "worst to best learner",
+        "few, mean of 3 learners",
+        "95 % bootstrap interval of the mean",
+        "many, mean of 20 learners",
+        "one",
+    ]
+    assert axes.get_ylabel() == "sigma"
+
+
+def test_every_metric_gets_a_panel():
+    values = {name: returns(3) * place for place, name in enumerate("abcd", start=1)}
+    panels = metric_panels(FRAMES, values).axes
+    assert [axes.get_title() for axes in panels if axes.get_visible()] == list("abcd")
+    for axes, value in zip(panels, values.values(), strict=False):
+        assert axes.get_lines()[0].get_ydata() == pytest.approx(value.mean(1))

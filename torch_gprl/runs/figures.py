@@ -59,13 +59,13 @@ def learning_curve(
 
 def compare_curves(
     curves: Mapping[str, tuple[Num[np.ndarray, " updates"], Float[np.ndarray, "updates learners"]]],
-    label: str,
+    metric: str,
 ) -> Figure:
     """Mean over learners of several runs against experience, each with its band as in `learning_curve`.
 
     Args:
         curves: name of the run -> environment steps per learner, and the metric of each learner.
-        label: what the metric is.
+        metric: what the values are.
     """
     figure = Figure(figsize=(6.4, 4), layout="constrained")
     axes = figure.add_subplot()
@@ -73,11 +73,11 @@ def compare_curves(
         colour = f"C{place % 10}"
         learners = values.shape[1]
         if learners > 1:
-            _, low, high = _band(values)
-            axes.fill_between(frames, low, high, color=colour, alpha=0.2, linewidth=0)
-        of = f" ({learners} learners)" if learners > 1 else ""
-        axes.plot(frames, values.mean(axis=1), color=colour, linewidth=1.8, label=f"{name}{of}")
-    axes.set(xlabel="environment steps per learner", ylabel=label)
+            band, low, high = _band(values)
+            axes.fill_between(frames, low, high, color=colour, alpha=0.2, linewidth=0, label=band)
+        label = f"{name}, mean of {learners} learners" if learners > 1 else name
+        axes.plot(frames, values.mean(axis=1), color=colour, linewidth=1.8, label=label)
+    axes.set(xlabel="environment steps per learner", ylabel=metric)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     open_frame(axes)
     axes.legend(frameon=False, fontsize="small", loc="best")

@@ -272,6 +272,8 @@ class WhitenedState(nn.Module):
         if self._active_rows is None or seen != self._active_seen:
             sizes = self.size.flatten().tolist()
             rows = max(sizes, default=0)
+            if len(sizes) > 1 and 4 * rows > 3 * self.capacity:
+                rows = self.capacity  # work on the others costs less than a copy of those in use
             mask = None if min(sizes, default=0) == rows else self.mask[..., :rows].unsqueeze(-1)
             basis = self.basis[..., :rows, :].contiguous()
             factor = self.gram_factor[..., :rows, :rows].contiguous()  # as triangular solvers want it

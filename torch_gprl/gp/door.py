@@ -1,5 +1,7 @@
 """The door of a GP: data come in here, are cast to the model's dtype, and are turned away if they are bad."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -19,7 +21,7 @@ def admit_inputs(inputs: Tensor, batch_shape: torch.Size, like: Tensor) -> Tenso
             f"inputs must be [*{tuple(batch_shape)}, points, {dims}], got {tuple(inputs.shape)}; "
             "a single point is inputs[..., None, :]"
         )
-    return inputs.to(like.dtype).expand(*batch_shape, *inputs.shape[-2:])
+    return _expanded(inputs.to(like.dtype), (*batch_shape, *inputs.shape[-2:]))
 
 
 def admit_points(
@@ -45,18 +47,53 @@ def admit_data(
     for name, tensor in (("targets", targets), ("mask", mask)):
         if tensor is not None and not _broadcasts(tensor.shape, expected):
             raise ValueError(f"{name} must be {tuple(expected)}, one per input, got {tuple(tensor.shape)}")
-    targets = targets.to(like.dtype).expand(expected)
+    targets = _expanded(targets.to(like.dtype), expected)
     if mask is not None:
         mask = mask.to(torch.bool).expand(expected)
         inputs = torch.where(mask.unsqueeze(-1), inputs, 0.0)
         targets = torch.where(mask, targets, 0.0)
-    if not bool(torch.isfinite(inputs.sum() + targets.sum())):  # one synchronisation; details only on failure
+    if not math.isfinite(float(inputs.sum() + targets.sum())):  # one synchronisation; details only on failure
         for name, tensor in (("inputs", inputs), ("targets", targets)):
             refuse_non_finite(name, tensor)
     return inputs, targets, mask
 
 
+def admit_successors(
+    next_inputs: Tensor | GaussianInputs,
+    discount: float | Tensor,
+    mask: Tensor | None,
+    points: torch.Size,
+    like: Tensor,
+) -> tuple[GaussianInputs, Tensor]:
+    """Successors of points [*batch, N], and their discounts; where that is 0 anything may stand.
+
+    Raises:
+        ValueError: shapes that do not fit the points, NaN or infinity in data that count.
+    """
+    if not isinstance(next_inputs, GaussianInputs):
+        next_inputs = GaussianInputs.exactly(next_inputs)
+    rate = torch.as_tensor(discount, dtype=like.dtype, device=like.device)
+    if not _broadcasts(rate.shape, points):
+        raise ValueError(
+            f"discount must be a number or {tuple(points)}, one per input, got {tuple(rate.shape)}; "
+            "0 stands where no successor counts"
+        )
+    rate = rate.expand(points)
+    counts = rate != 0 if mask is None else mask & (rate != 0)
+    mean, rate, _ = admit_data(next_inputs.mean, rate, counts, points[:-1], like)
+    variance = next_inputs.variance.to(mean.dtype).expand(*mean.shape[:-1], -1)
+    variance = torch.where(counts.unsqueeze(-1), variance, 0.0)
+    refuse_non_finite("variance of next_inputs", variance)
+    return GaussianInputs(mean, variance, next_inputs.columns), rate
+
+
+def _expanded(tensor: Tensor, shape: tuple[int, ...]) -> Tensor:
+    return tensor if tensor.shape == shape else tensor.expand(shape)
+
+
 def _broadcasts(shape: torch.Size, target: torch.Size) -> bool:
+    if shape == target:
+        return True
     padded = (1,) * (len(target) - len(shape)) + tuple(shape)
     return len(padded) == len(target) and all(a in (1, b) for a, b in zip(padded, target, strict=True))
 

@@ -16,8 +16,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torch_gprl.gp.door import admit_data
+from torch_gprl.gp.observed import Observed
 from torch_gprl.gp.selection import select_novel
-from torch_gprl.gp.sparse_online import CHURN, Observed, SparseOnlineGP
+from torch_gprl.gp.sparse_online import SparseOnlineGP
 from torch_gprl.gp.whitened import NOVELTY_FLOOR
 from torch_gprl.kernels.gaussian_inputs import GaussianInputs
 
@@ -94,9 +95,8 @@ class ParallelSparseGP(SparseOnlineGP):
             return error
         return None
 
-    def _absorb_point(self, point: Tensor, target: float, noise: float) -> None:
-        targets = self.information.new_full((1,), target)
-        self._absorb_block(Observed(point, targets, None, None, None), self.noise_variance.unsqueeze(-1))
+    def _is_alone(self) -> bool:
+        return False
 
     def _absorb_block(self, block: Observed, noise: Tensor) -> None:
         points = self._points_of_all(block)
@@ -105,8 +105,7 @@ class ParallelSparseGP(SparseOnlineGP):
             phi, novelty = self._difference(phi, block.inputs, block.next_inputs, block.discount)
         variance = noise + novelty if self.projection == "moment" else noise.expand_as(novelty)
         self._accumulate(phi, variance, block.targets, block.mask)
-        room = -(-points.clamp_min(1) // CHURN)
-        full = self.size > self.capacity - room.clamp_max(self.overshoot)
+        full = self._is_full(self.size, points)
         if bool(full.any()):
             self._prune(full)
 
@@ -134,7 +133,7 @@ class ParallelSparseGP(SparseOnlineGP):
 
         phi, novelty, _ = self._judge(inputs, mask, noise)
         residual = self.kernel(inputs, inputs) - phi.mT @ phi
-        wanted = (self.budget - self.size).clamp_min(0) + self._churn(None, points)
+        wanted = (self.budget - self.size).clamp_min(0) + self._churn(points)
         limit = torch.minimum(wanted, self.capacity - self.size)
         selection = select_novel(
             residual, novelty.where(mask, -torch.inf), self._threshold(inputs, noise), limit

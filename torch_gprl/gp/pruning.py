@@ -162,13 +162,7 @@ def keep_first(
         the state [*batch, kept, ...] and the change of the log evidence's constant [*batch]: with `"moment"`
         such that the evidence stays what it was, with `"dtc"` none.
     """
-    index = order.unsqueeze(-1).expand_as(state.gram_factor)
-    orthogonal, upper = torch.linalg.qr(state.gram_factor.gather(-2, index).mT)  # P L = Rᵀ Qᵀ
-    sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0).to(upper.dtype)
-    gram_factor = (upper * sign.unsqueeze(-1)).mT[..., :kept, :kept]
-    rotation = orthogonal * sign.unsqueeze(-2)  # Tᵀ
-    precision = rotation.mT @ state.precision @ rotation  # T A Tᵀ
-    information = (rotation.mT @ state.information.unsqueeze(-1)).squeeze(-1)
+    gram_factor, precision, information = _triangular(state, order, kept)
     left, left_information = precision[..., :kept, :kept], information[..., :kept]
     if projection == "dtc":
         return Whitened(gram_factor, left, left_information), torch.zeros_like(information[..., 0])
@@ -183,3 +177,31 @@ def keep_first(
     log_determinant = 2 * gone_factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     evidence = 0.5 * (half_information.square().sum((-2, -1)) - log_determinant)
     return Whitened(gram_factor, left, left_information), evidence
+
+
+PANEL = 48  # columns that are made triangular at once
+
+
+def _triangular(state: Whitened, order: Tensor, kept: int) -> Whitened:
+    """T, A and b in the coordinates w' = T w in which the first `kept` rows of P L are triangular.
+
+    P L = L' T by Householder QR of its transpose, a panel of columns at a time: a vector that moves up by d
+    places leaves d entries to be rotated away, so a panel touches few rows more than it has columns.
+    """
+    rows, lower = order[..., :kept], state.gram_factor
+    upper = lower.gather(-2, rows.unsqueeze(-1).expand(*rows.shape, lower.shape[-1])).mT
+    # all that is rotated from the left, in one matrix
+    joint = torch.cat([upper, state.information.unsqueeze(-1), state.precision], -1)
+    precision = joint[..., kept + 1 :]
+    reach = rows.cummax(-1).values.reshape(-1, kept).amax(0)  # last entry in the panels up to each column
+    for start in range(0, kept, PANEL):
+        stop = min(start + PANEL, kept)
+        touched = slice(start, int(reach[stop - 1]) + 1)
+        rotation, triangle = torch.linalg.qr(joint[..., touched, start:stop], mode="complete")
+        joint[..., touched, start:stop] = triangle
+        joint[..., touched, stop:] = rotation.mT @ joint[..., touched, stop:]
+        precision[..., touched] = precision[..., touched] @ rotation
+    sign = torch.ones_like(state.information)
+    sign[..., :kept] = joint.diagonal(dim1=-2, dim2=-1)[..., :kept].sign()
+    joint, precision = joint * sign.unsqueeze(-1), precision * sign.unsqueeze(-2)
+    return Whitened(joint[..., :kept, :kept].mT, precision * sign.unsqueeze(-1), joint[..., kept])

@@ -68,8 +68,9 @@ class GaussianBumps:
         """Covariances with x [*batch, N, D]."""
         x = (x.to(self.peak.dtype) - self.centre) * self.inverse
         square = torch.linalg.vecdot(x, x).unsqueeze(-1)
-        if x.ndim == 2 and self.points.ndim == 2:
-            exponent = torch.addmm(self.peak, x, self.points.mT)
+        add_product = {2: torch.addmm, 3: torch.baddbmm}.get(x.ndim)
+        if add_product is not None and x.shape[:-2] == self.points.shape[:-2]:
+            exponent = add_product(self.peak, x, self.points.mT)
         else:
             exponent = self.peak + x @ self.points.mT
         return exponent.sub_(square, alpha=0.5).exp_().mT

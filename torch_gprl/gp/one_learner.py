@@ -1,0 +1,122 @@
+"""How one learner on the CPU learns from plain regression data: as many do, in a third of the time.
+
+The numbers that decide (how many rows are in use, which point is the most novel) live on the host, matrices
+are views of the rows in use, and nothing is masked.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from torch_gprl.gp.bounded import YOUTH, BoundedBasis, admissions
+from torch_gprl.gp.observed import Observed
+from torch_gprl.gp.whitened import NOVELTY_FLOOR, solve_triangular, squared_columns
+
+LOG_TWO_PI = math.log(2 * math.pi)
+
+
+def absorb(gp: BoundedBasis, block: Observed, noise_variance: float) -> None:
+    """Bayes' rule on a block of plain data: grow the basis, absorb every point, prune to the budget."""
+    inputs, targets = _only(block.inputs, 2), _only(block.targets, 1)
+    points = len(inputs)
+    learn = _absorb_point if points == 1 else _absorb_block
+    rows = learn(gp, inputs, targets, noise_variance)
+    gp.observations.add_(points)
+    if not gp._stale:
+        gp._stale = True
+    if gp._is_full(rows, points):
+        gp._prune(gp.size == rows)
+
+
+def _absorb_block(gp: BoundedBasis, inputs: Tensor, targets: Tensor, noise_variance: float) -> int:
+    """The rows in use afterwards."""
+    phi, prior = _explain(gp, inputs)
+    novelty = prior - squared_columns(phi)
+    threshold = (prior * NOVELTY_FLOOR[phi.dtype]).clamp_min_(gp.novelty_threshold * noise_variance)
+    if float((novelty - threshold).amax()) > 0 and (most := _most_additions(gp, len(phi), len(inputs))):
+        phi, novelty = _add_most_novel(gp, inputs, phi, novelty, threshold, most)
+    rows = len(phi)
+    # moment: W = 1/(σ0² + ν); dtc ignores what the basis misses
+    variance = novelty.add_(noise_variance) if gp.projection == "moment" else novelty.fill_(noise_variance)
+    noise = variance.sqrt()
+    phi, targets = phi / noise, targets / noise
+    _only(gp.precision, 2)[:rows, :rows].addmm_(phi, phi.mT)  # A += Φ W Φᵀ
+    _only(gp.information, 1)[:rows].add_(phi.mv(targets))  # b += Φ W y
+    log_density = variance.log_().sum() + targets.dot(targets)
+    gp.evidence_constant.sub_(log_density + len(inputs) * LOG_TWO_PI, alpha=0.5)
+    return rows
+
+
+def _absorb_point(gp: BoundedBasis, point: Tensor, target: Tensor, noise_variance: float) -> int:
+    """`_absorb_block` for one point, in half the time."""
+    phi, variance = _explain(gp, point)
+    rows, prior = len(phi), float(variance)
+    novelty = prior - float(squared_columns(phi))
+    threshold = max(gp.novelty_threshold * noise_variance, NOVELTY_FLOOR[phi.dtype] * prior)
+    if novelty > threshold and _most_additions(gp, rows, 1):
+        phi = torch.cat([phi, phi.new_full((1, 1), math.sqrt(novelty))])
+        _append(gp, rows, phi.mT, point)
+        rows, novelty = rows + 1, 0.0
+    weight = 1 / (noise_variance + novelty) if gp.projection == "moment" else 1 / noise_variance
+    observed = float(target)
+    _only(gp.precision, 2)[:rows, :rows].addmm_(phi, phi.mT, alpha=weight)
+    _only(gp.information, 1)[:rows].add_(phi[:, 0], alpha=weight * observed)
+    gp.evidence_constant.add_(0.5 * (math.log(weight) - weight * observed**2 - LOG_TWO_PI))
+    return rows
+
+
+def _explain(gp: BoundedBasis, inputs: Tensor) -> tuple[Tensor, Tensor]:
+    """φ in columns, and the prior variance."""
+    active = gp._active()
+    phi = solve_triangular(_only(active.gram_factor, 2), _only(active.cross(inputs), 2))
+    return phi, _only(gp.kernel.diag(inputs), 1)
+
+
+def _most_additions(gp: BoundedBasis, rows: int, points: int) -> int:
+    """Free growth up to the budget, then the churn, never past the buffers."""
+    before, youth = int(gp.observations), YOUTH * gp.budget
+    after = before + points
+    group, churn = gp._group(points), 1
+    if gp.order == "novelty":
+        churn = admissions(after, min(after, youth), youth, group)
+        churn -= admissions(before, min(before, youth), youth, group)
+    return min(max(gp.budget - rows, 0) + churn, gp.capacity - rows, points)
+
+
+def _add_most_novel(
+    gp: BoundedBasis, inputs: Tensor, phi: Tensor, novelty: Tensor, threshold: Tensor, most: int
+) -> tuple[Tensor, Tensor]:
+    """Partially pivoted Cholesky of what the basis misses: one row of L, and of Φ, for each point picked."""
+    before = rows = len(phi)
+    features = phi.new_empty(len(inputs), before + most)  # Φᵀ
+    features[:, :before] = phi.mT
+    pivots: list[int] = []
+    while rows < before + most:
+        excess, best = (novelty - threshold).max(0)
+        if float(excess) <= 0:
+            break
+        pivot, known = int(best), features[:, :rows]
+        covariance = _only(gp.kernel(inputs[pivot : pivot + 1], inputs), 2)[0]
+        row = torch.addmv(covariance, known, known[pivot], alpha=-1)
+        features[:, rows] = row.mul_(row[pivot].rsqrt())
+        novelty.addcmul_(row, row, value=-1)
+        novelty[pivot] = 0.0  # nothing is missed of a basis vector
+        pivots.append(pivot)
+        rows += 1
+    _append(gp, before, features[pivots, :rows].tril_(before), inputs[pivots])
+    return features[:, :rows].mT, novelty
+
+
+def _append(gp: BoundedBasis, before: int, gram_rows: Tensor, points: Tensor) -> None:
+    """Write new basis vectors, and their rows of L [J, before + J], behind those in use."""
+    after = before + len(points)
+    _only(gp.gram_factor, 2)[before:after, :after] = gram_rows
+    _only(gp.basis, 2)[before:after] = points
+    _only(gp.stamps, 1)[before:after] = gp.clock
+    gp.size.fill_(after)
+
+
+def _only(tensor: Tensor, dims: int) -> Tensor:
+    """The last `dims` dimensions of a tensor whose others have size 1."""
+    return tensor if tensor.ndim == dims else tensor.reshape(tensor.shape[tensor.ndim - dims :])

@@ -4,12 +4,14 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from torch_gprl.critics import EstimatorName, KernelName
+from torch_gprl.critics import USE_ALL_ACTIONS, EstimatorName, KernelName
+from torch_gprl.policies.gibbs_energy import EnergyForm
 
 ControllerForm = Literal["linear", "rbf", "mlp"]
 CriticForm = Literal["gp", "neural"]
 Optimiser = Literal["natural", "episodic-natural", "adam", "plain"]
-Exploration = Literal["learned", "fixed", "scheduled"]
+Exploration = Literal["learned", "fixed", "scheduled", "confidence", "gibbs"]
+GUIDED = ("confidence", "gibbs")  # explorations that ask the critic
 Targets = Literal["returns", "differences"]
 AgeForm = Literal["exponential", "logit"]
 
@@ -20,6 +22,7 @@ CHOICES = {
     "controller": ControllerForm,
     "optimiser": Optimiser,
     "exploration": Exploration,
+    "gibbs_form": EnergyForm,
     "targets": Targets,
     "age_form": AgeForm,
 }
@@ -45,6 +48,8 @@ LEAST = {
 POSITIVE = (
     "std",
     "final_std",
+    "inverse_temperature",
+    "final_inverse_temperature",
     "trust_region",
     "learning_rate",
     "noise",
@@ -70,9 +75,12 @@ class PolicyGradientConfig:
     trace: float = 0.9  # λ of the estimator "generalised", from 0 to 1
 
     controller: ControllerForm = "mlp"  # form of the controller f(s)
-    std: float = 0.5  # initial exploration standard deviation, in halves of the actuator's range
-    exploration: Exploration = "learned"  # of the standard deviation; scheduled goes in equal steps
-    final_std: float = 0.1  # where the scheduled standard deviation ends, in halves of the actuator's range
+    exploration: Exploration = "learned"  # standard deviation learned, fixed, scheduled; or by the critic
+    std: float = 0.5  # σ at first, in halves of the actuator's range; confidence: for one target variance
+    final_std: float = 0.1  # σ at last if scheduled, at least for confidence; in halves of the range
+    gibbs_form: EnergyForm = "robust"  # gibbs: the thesis' energy, or its sibling that stays near f(s)
+    inverse_temperature: float = 3.0  # gibbs: β at first, for values scaled by their range over the actions
+    final_inverse_temperature: float = 30.0  # gibbs: β at last, by equal factors; its σ_e is std
     optimiser: Optimiser = "natural"  # natural gradient, the same by regression on episodes, Adam, or plain
     trust_region: float = 0.05  # KL divergence of the first natural step, nats; falls linearly to 0
     learning_rate: float = 0.01  # of Adam and of the plain gradient; falls linearly to 0
@@ -125,6 +133,12 @@ class PolicyGradientConfig:
             )
         if self.critic == "neural" and self.estimator == "k-step-baseline" and self.horizon == 0:
             raise ValueError("critic 'neural' needs at least one real reward: horizon 1 or more, got 0")
+        if self.exploration in GUIDED and self.critic != "gp":
+            raise ValueError(
+                f"exploration {self.exploration!r} asks the variance or the values of critic 'gp'"
+            )
+        if self.exploration == "gibbs" and self.estimator in USE_ALL_ACTIONS:
+            raise ValueError(f"estimator {self.estimator!r} averages over a normal policy, not over gibbs")
         if self.optimiser == "episodic-natural" and self.estimator != "return":
             raise ValueError(
                 "optimiser 'episodic-natural' regresses returns of episodes and needs estimator 'return', "

@@ -15,11 +15,12 @@ import torch
 from jaxtyping import Float
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.distributions import kl_divergence
 from torchrl.envs import EnvBase
 
 from torch_gprl.critics import USE_ALL_ACTIONS, Evaluation, GPActionValue, GPValueEstimator
 from torch_gprl.learners.collecting import Collection
-from torch_gprl.learners.config import PolicyGradientConfig
+from torch_gprl.learners.config import GUIDED, PolicyGradientConfig
 from torch_gprl.learners.neural_value import NeuralTeacher, NeuralValue
 from torch_gprl.learners.teaching import Teacher, make_critic
 from torch_gprl.objectives import (
@@ -31,13 +32,25 @@ from torch_gprl.objectives import (
     split_episodes,
     step_along,
 )
-from torch_gprl.policies import Controller, LinearController, MLPController, RBFController, gaussian_policy
+from torch_gprl.policies import (
+    ConfidenceNoise,
+    ConfidenceScale,
+    Controller,
+    GaussianPolicy,
+    GibbsConfig,
+    GibbsPolicy,
+    LinearController,
+    MLPController,
+    RBFController,
+    ScaledController,
+    gaussian_policy,
+)
 
 FISHER_EVERY = 4  # one step in four of a rollout enters the Fisher matrix
 
 
 class PolicyGradient:
-    """Trains Gaussian policies, one for each learner of `env`, with a critic for each.
+    """Trains stochastic policies, one for each learner of `env`, with a critic for each.
 
     Args:
         env: environment of batch [learners, environments] with a bounded action.
@@ -61,17 +74,17 @@ class PolicyGradient:
         controller = _controller(config.controller, *dims, indices, seed).to(
             env.observation_spec["observation"].dtype
         )
-        self.policy = gaussian_policy(controller, env.action_spec, config.std, seed, learners=indices).to(
-            env.device
-        )
-        self.teacher = self._teacher(seed, first_learner)
+        self.controller = controller.to(env.device)
+        gaussian = gaussian_policy(controller, env.action_spec, config.std, seed, learners=indices)
+        gaussian.to(env.device)
+        gaussian.head.log_std.requires_grad_(config.exploration == "learned")
+        self.teacher = self._teacher(gaussian, seed, first_learner)
         self.critic = self.teacher.critic
+        self.policy = self._explorer(gaussian)
         self.value_estimator = GPValueEstimator(
             self.critic, self.policy, config.discount, config.estimator, config.horizon, config.trace
         )
         self.losses = self._losses()
-        if config.exploration != "learned":
-            self.policy.head.log_std.requires_grad_(False)
         kind = torch.optim.Adam if config.optimiser == "adam" else torch.optim.SGD
         self.optimiser = kind(self._trained(), lr=config.learning_rate)
         self.collection = Collection(env, self.policy, config.rollout_steps)
@@ -80,13 +93,31 @@ class PolicyGradient:
         self.updates = 0
         self._last_return = torch.full((self.learners,), torch.nan, device=env.device)
 
-    def _teacher(self, seed: int, first_learner: int) -> Teacher | NeuralTeacher:
+    def _teacher(self, policy: GaussianPolicy, seed: int, first_learner: int) -> Teacher | NeuralTeacher:
         """An empty critic, with what teaches it."""
         if self.config.critic == "gp":
-            critic = make_critic(self.policy, self.config, self.learners).to(self.env.device)
-            return Teacher(critic, self.policy, self.config)
-        dims = self.policy.head.controller.observation_dim
+            critic = make_critic(policy, self.config, self.learners).to(self.env.device)
+            return Teacher(critic, policy, self.config)
+        dims = self.controller.observation_dim
         return NeuralTeacher(NeuralValue(dims, self.learners, seed, first_learner).to(self.env.device))
+
+    def _explorer(self, gaussian: GaussianPolicy) -> GaussianPolicy | ConfidenceNoise | GibbsPolicy:
+        """The Gaussian policy, or one round the same controller that the critic guides."""
+        config, head = self.config, gaussian.head
+        if config.exploration not in GUIDED or not isinstance(self.teacher, Teacher):
+            return gaussian
+        critic = self.teacher.critic
+        low, high = head.centre - head.half_range, head.centre + head.half_range
+        greedy = ScaledController(head.controller, low, high)
+        if config.exploration == "confidence":
+            scale = ConfidenceScale(config.std**2, config.final_std, max(1.0, config.final_std))
+            policy = ConfidenceNoise(greedy, critic, scale, gaussian.noise)
+        else:
+            first, last = config.inverse_temperature, config.final_inverse_temperature
+            numbers = GibbsConfig(config.gibbs_form, first, last, config.std)
+            policy = GibbsPolicy(greedy, critic, numbers, gaussian.noise)
+        self.teacher.policy = policy.to(self.env.device)
+        return policy
 
     def _losses(self) -> list[PolicyGradientLoss | AllActionLoss]:
         """The terms of the objective: sampled scores, all actions in closed form, or both."""
@@ -128,7 +159,7 @@ class PolicyGradient:
         """Scale the controller's inputs by the first rollout; until then it acts zero everywhere."""
         observation = rollout.get("observation").flatten(1, 2)
         std = observation.std(1)
-        self.policy.head.controller.standardise(observation.mean(1), torch.where(std > 1e-6, std, 1.0))
+        self.controller.standardise(observation.mean(1), torch.where(std > 1e-6, std, 1.0))
 
     @torch.no_grad()
     def _weigh(self, rollout: TensorDictBase) -> Evaluation:
@@ -153,11 +184,16 @@ class PolicyGradient:
         else:
             self.optimiser.param_groups[0]["lr"] = self.config.learning_rate * left
             self.optimiser.step()
-        if self.config.exploration == "scheduled":
-            done = (self.updates + 1) / self.total_updates
+        self._anneal((self.updates + 1) / self.total_updates)
+        return figures
+
+    def _anneal(self, done: float) -> None:
+        """Set what changes in the exploration by a schedule, for a share of the training that is over."""
+        if isinstance(self.policy, GibbsPolicy):
+            self.policy.anneal(done)
+        elif isinstance(self.policy, GaussianPolicy) and self.config.exploration == "scheduled":
             std = self.config.std + done * (self.config.final_std - self.config.std)
             self.policy.head.log_std.data.fill_(math.log(std))
-        return figures
 
     def _differentiate(
         self, rollout: TensorDictBase, parameters: list[torch.nn.Parameter]
@@ -183,15 +219,19 @@ class PolicyGradient:
         """The natural gradient as the episodic natural actor-critic finds it."""
         discount = self.config.discount if self.config.discount_states else 1.0
         episodes = split_episodes(rollout.get(("next", "done")).squeeze(-1), discount)
-        distribution = self.policy.get_dist(rollout.select(*self.policy.in_keys))
+        distribution = self.policy.get_dist(rollout)
         scores = episode_scores(distribution.log_prob(rollout.get("action")), parameters, episodes)
         returns = episodes.sums(rollout.get(("next", "reward")).squeeze(-1))
         return compatible_weights(scores, returns, episodes.used).to(parameters[0].dtype)
 
     def _divergence(self, rollout: TensorDictBase) -> Callable[[], Tensor]:
         """Mean KL(π_now ‖ π_θ) over states of the rollout [learners], a function of the parameters θ."""
-        observation = rollout.get("observation")[:, :, ::FISHER_EVERY]
-        head = self.policy.head
+        some, policy = rollout[:, :, ::FISHER_EVERY], self.policy
+        if not isinstance(policy, GaussianPolicy):
+            with torch.no_grad():
+                now = policy.get_dist(some)
+            return lambda: kl_divergence(now, policy.get_dist(some)).flatten(1).mean(1)
+        observation, head = rollout.get("observation")[:, :, ::FISHER_EVERY], policy.head
         with torch.no_grad():
             loc, scale = head.parameters_at(observation)
 
@@ -215,7 +255,7 @@ class PolicyGradient:
         surprise = (seen.to_go - seen.value).flatten(1)
         return self.teacher.figures() | {
             "return": self._last_return,
-            "sigma": self.policy.std.mean(-1),
+            "sigma": rollout.get("scale").flatten(1).mean(1),
             "value_error": error.square().mean(1).sqrt(),
             "explained_variance": 1 - surprise.var(1) / seen.to_go.flatten(1).var(1),
         }

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
@@ -69,7 +70,8 @@ class Teacher:
     """
 
     def __init__(self, critic: GPActionValue, policy: GaussianPolicy, config: PolicyGradientConfig) -> None:
-        self.critic, self.policy, self.config = critic, policy, config
+        self.critic, self.config = critic, config
+        self.policy: ProbabilisticTensorDictSequential = policy
         self.replay: TensorDictReplayBuffer | None = None
         if config.replay:
             self.replay = TensorDictReplayBuffer(storage=LazyTensorStorage(config.replay))

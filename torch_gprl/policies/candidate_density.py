@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import Distribution, constraints, register_kl
 from torch.quasirandom import SobolEngine
 
 from torch_gprl.policies.gibbs_energy import Window
@@ -108,7 +108,7 @@ class CandidateDensity(Distribution):
         log_density: Float[Tensor, "*batch P"],
         log_density_at: Callable[[Tensor], Tensor],
     ) -> None:
-        self.candidates, self.log_density_at = candidates, log_density_at
+        self.candidates, self.log_density, self.log_density_at = candidates, log_density, log_density_at
         ratio = log_density - candidates.log_proposal
         self.log_normaliser = ratio.logsumexp(-1) - torch.tensor(float(ratio.shape[-1])).log().to(ratio)
         self.weight = ratio.softmax(-1)
@@ -147,3 +147,10 @@ class CandidateDensity(Distribution):
         """E (a − E a)², of each dimension."""
         square = (self.candidates.action - self.mean.unsqueeze(-2)).square()
         return (self.weight.unsqueeze(-1) * square).sum(-2)
+
+
+@register_kl(CandidateDensity, CandidateDensity)
+def _divergence(p: CandidateDensity, q: CandidateDensity) -> Tensor:
+    """KL(p ‖ q) of densities weighed at the same candidates [*batch]."""
+    difference = (p.weight * (p.log_density - q.log_density)).sum(-1)
+    return difference - p.log_normaliser + q.log_normaliser

@@ -10,7 +10,7 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from torch_gprl.runs import Algorithm, CommandLine, UserError
+from torch_gprl.runs import Algorithm, CommandLine, RunFolder, UserError
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,14 @@ class Run:
 
 
 @dataclass(frozen=True)
+class Noise:
+    """How much of it."""
+
+    least: float = 0.1  # standard deviation
+    most: float = 1.0  # standard deviation
+
+
+@dataclass(frozen=True)
 class Numbers:
     """How."""
 
@@ -30,6 +38,7 @@ class Numbers:
     noise: float = 0.1  # variance
     age_form: Literal["exponential", "logit"] = "exponential"  # of the age
     in_sample: bool = False  # whether to cheat
+    exploration: Noise = field(default_factory=lambda: Noise(0.2))
 
 
 @dataclass(frozen=True)
@@ -98,6 +107,14 @@ def test_a_file_is_read_with_or_without_sections(tmp_path, text):
     assert (name, options) == ("second", Options(Run(seed=4), Numbers(noise=1e-3, in_sample=True)))
 
 
+def test_what_a_run_writes_of_nested_options_can_be_read_again(tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    options = Options(algorithm=Numbers(exploration=Noise(0.3, 4.0)))
+    folder.write_config({"algorithm": "second", "run": options.run, "config": options.algorithm})
+    assert LINE.parse(["--config", str(folder.config)]) == ("second", options)
+    assert LINE.parse(["second", "--least", "0.3", "--most", "4"]) == ("second", options)
+
+
 def test_the_command_line_wins_over_the_file_and_the_file_over_presets(tmp_path):
     path = a_file(tmp_path, "task: run\nbudget: 9\nseed: -1")
     options = LINE.parse(["--seed", "5", f"--config={path}"])[1]
@@ -117,6 +134,8 @@ MISTAKES = {
     "budget: many": r"settings.yaml: Error parsing --budget: .*'many'",
     "budget: true": r"settings.yaml: Error parsing --budget: .*'True'",
     "budget: [1, 2]": r"budget must be a single value, not \[1, 2\]",
+    "exploration: 1": r"exploration must hold names and values, not 1",
+    "exploration: {leest: 1}": r"unknown setting 'leest'; did you mean 'least'",
     "in_sample: 1": r"in_sample must be true or false, not 1",
     "age_form: linear": r"invalid choice 'linear' for argument '--age-form'. Expected one of",
     "algorithm: thrid": r"unknown algorithm 'thrid'; .*one of first, second",

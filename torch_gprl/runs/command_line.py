@@ -213,20 +213,25 @@ def as_arguments(settings: Mapping[str, object], kinds: Sequence[type], source: 
     """Settings as arguments of a command line.
 
     Args:
-        settings: option -> value, with underscores; None leaves an option at its default.
+        settings: option -> value, with underscores; None leaves an option at its default. Options that are
+            dataclasses hold names and values, which become options of their own, as tyro makes them.
         kinds: the dataclasses that have the options.
         source: where the settings come from, for messages.
 
     Raises:
         UserError: if there is no such option, or the value is not a single one.
     """
-    types = {field.name: field.type for kind in kinds for field in dataclasses.fields(kind)}
+    types: dict[str, Any] = {field.name: field.type for kind in kinds for field in dataclasses.fields(kind)}
     arguments = []
     for name, value in settings.items():
         if name not in types:
             raise UserError(f"{source}: unknown setting '{shown(name)}'; {nearest(name, types)}")
         flag = name.replace("_", "-")
-        if types[name] is bool:
+        if dataclasses.is_dataclass(types[name]):
+            if not isinstance(value, Mapping):
+                raise UserError(f"{source}: {name} must hold names and values, not {shown(value)}")
+            arguments += as_arguments(value, [types[name]], source)
+        elif types[name] is bool:
             if not isinstance(value, bool):
                 raise UserError(f"{source}: {name} must be true or false, not {shown(value)}")
             arguments.append(f"--{flag}" if value else f"--no-{flag}")

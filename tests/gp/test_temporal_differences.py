@@ -148,3 +148,16 @@ def test_a_batch_of_learners_learns_differences_as_each_alone() -> None:
         torch.testing.assert_close(
             batch.posterior(points).mean[i], alone.posterior(points[i]).mean, rtol=0, atol=1e-8
         )
+
+
+def test_a_batch_that_fills_its_buffers_bit_by_bit_learns_as_each_alone() -> None:
+    # the rows in use grow past three quarters of the buffers within an update
+    inputs = torch.randn(12, 2, 7, 2, dtype=F64)
+    batch = SparseOnlineGP(SquaredExponential(2, 0.3, batch_shape=(2,)), 40, NOISE)
+    alone = SparseOnlineGP(SquaredExponential(2, 0.3), 40, NOISE)
+    for x in inputs:
+        batch.update(x, x[..., 0], next_inputs=x + 0.1, discount=0.9)
+        alone.update(x[1], x[1, :, 0], next_inputs=x[1] + 0.1, discount=0.9)
+    torch.testing.assert_close(batch.size[1], alone.size)
+    query = torch.randn(2, 9, 2, dtype=F64)
+    torch.testing.assert_close(batch.posterior(query).mean[1], alone.posterior(query[1]).mean)

@@ -4,13 +4,17 @@ import pytest
 import torch
 
 from torch_gprl.gp import PathSampler, SparseOnlineGP
-from torch_gprl.kernels import Kernel, Matern, RationalQuadratic, SquaredExponential
+from torch_gprl.kernels import Columns, Kernel, Matern, RationalQuadratic, SquaredExponential
 
 LEARNERS, DIMS = 2, 2
 KERNELS = {
     "squared exponential": lambda: SquaredExponential(DIMS, 0.8, 1.5, batch_shape=(LEARNERS,)),
     "Matérn 1/2": lambda: Matern(DIMS, 0.8, 1.5, batch_shape=(LEARNERS,), smoothness=0.5),
     "Matérn 3/2": lambda: Matern(DIMS, 0.8, 1.5, batch_shape=(LEARNERS,), smoothness=1.5),
+    "product": lambda: (
+        Columns(Matern(1, 0.8, 1.5, batch_shape=(LEARNERS,), smoothness=2.5), (1,), DIMS)
+        * Columns(SquaredExponential(1, 0.6, batch_shape=(LEARNERS,)), (0,), DIMS)
+    ),
     "Matérn 5/2": lambda: Matern(DIMS, 0.8, 1.5, batch_shape=(LEARNERS,), smoothness=2.5),
 }
 
@@ -92,6 +96,6 @@ def test_a_learners_functions_do_not_depend_on_the_others():
 def test_a_kernel_of_unknown_spectrum_is_refused():
     gp = SparseOnlineGP(RationalQuadratic(DIMS, batch_shape=(LEARNERS,)), 20)
     with pytest.raises(
-        TypeError, match="need a SquaredExponential or a Matern kernel, got RationalQuadratic"
+        TypeError, match="need SquaredExponential or Matern kernels, or products, got RationalQuadratic"
     ):
         sampler(gp, 10)

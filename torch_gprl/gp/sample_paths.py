@@ -10,7 +10,7 @@ basis, and the first carries what the basis misses of x: far from all data f is 
 function for all inputs, unlike a draw of the joint posterior, which is one for the inputs it was drawn at.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,7 +19,8 @@ from torch import Tensor
 
 from torch_gprl.gp.sparse_online import SparseOnlineGP
 from torch_gprl.gp.whitened import solve_triangular
-from torch_gprl.kernels import Matern, SquaredExponential
+from torch_gprl.kernels import Columns, Kernel, Matern, SquaredExponential
+from torch_gprl.kernels.base import Product
 
 
 class Paths(NamedTuple):
@@ -29,13 +30,21 @@ class Paths(NamedTuple):
     basis: Float[Tensor, "*batch E B"]
 
 
+class Factor(NamedTuple):
+    """A factor of a kernel, the columns of the inputs that it sees, and frequencies from its spectrum."""
+
+    kernel: SquaredExponential | Matern
+    columns: tuple[int, ...]
+    frequencies: Float[Tensor, "*batch F d"]  # for unit length scales
+
+
 class PathSampler:
     """Draws functions from a GP's posterior as it stands, from given normal numbers.
 
     The same numbers give the same random function, seen in the light of more data once the GP has learned.
 
     Args:
-        gp: the process; its kernel is a squared exponential or a Matérn.
+        gp: the process; its kernel is a squared exponential, a Matérn, or a product of such on any columns.
         features: random frequencies; the prior's covariance is off by about one over their root.
         generators: of the frequencies, one for each entry of the flattened batch shape.
 
@@ -44,26 +53,22 @@ class PathSampler:
     """
 
     def __init__(self, gp: SparseOnlineGP, features: int, generators: Sequence[torch.Generator]) -> None:
-        if not isinstance(gp.kernel, SquaredExponential | Matern):
-            raise TypeError(
-                f"sample paths need a SquaredExponential or a Matern kernel, got {type(gp.kernel).__name__}; "
-                "gp.joint(inputs) draws values at given inputs for any kernel"
-            )
-        self.gp = gp
-        dims = gp.kernel.input_dim
-        drawn = [_unit_frequencies(gp.kernel, features, dims, generator) for generator in generators]
-        self.frequencies = torch.stack(drawn).reshape(*gp.batch_shape, features, dims).to(gp.basis)
+        self.gp, self.features = gp, features
+        self.factors = [
+            Factor(kernel, columns, _unit_frequencies(kernel, features, gp.batch_shape, generators))
+            for kernel, columns in _stationary_factors(gp.kernel, tuple(range(gp.kernel.input_dim)))
+        ]
 
     @property
     def random_numbers(self) -> int:
         """Standard normal numbers that a function takes."""
-        return 2 * self.frequencies.shape[-2] + self.gp.capacity
+        return 2 * self.features + self.gp.capacity
 
     @torch.no_grad()
     def draw(self, normal: Float[Tensor, "*batch E R"]) -> Paths:
         """E functions for each learner, from as many normal numbers each as `random_numbers` says."""
         solved, active = self.gp._solved(), self.gp._active()
-        features, ε = normal.to(active.basis).tensor_split((2 * self.frequencies.shape[-2],), -1)
+        features, ε = normal.to(active.basis).tensor_split((2 * self.features,), -1)
         ε = ε[..., : active.rows].mT
         w = solved.weights.unsqueeze(-1) + solve_triangular(solved.precision_factor.mT, ε, upper=True)
         at_basis = self._features(active.basis) @ features.mT
@@ -81,24 +86,55 @@ class PathSampler:
 
     def _features(self, inputs: Float[Tensor, "*batch N D"]) -> Float[Tensor, "*batch N F2"]:
         """Features whose products average to the kernel: √(σ²/F) (cos ωᵀx, sin ωᵀx)."""
-        kernel = self.gp.kernel
-        assert isinstance(kernel, SquaredExponential | Matern)
-        phase = (inputs / kernel.lengthscale.unsqueeze(-2)) @ self.frequencies.mT
-        amplitude = (kernel.outputscale / self.frequencies.shape[-2]).sqrt()[..., None, None]
+        phase = sum(  # the spectrum of a product is that of a sum of independent frequencies
+            (inputs[..., list(columns)] / kernel.lengthscale.unsqueeze(-2)) @ frequencies.to(inputs).mT
+            for kernel, columns, frequencies in self.factors
+        )
+        assert isinstance(phase, Tensor)
+        amplitude = (self.gp.kernel.diag(inputs) / self.features).sqrt().unsqueeze(-1)
         return amplitude * torch.cat([phase.cos(), phase.sin()], -1)
 
 
+def _stationary_factors(
+    kernel: Kernel, columns: tuple[int, ...]
+) -> Iterator[tuple[SquaredExponential | Matern, tuple[int, ...]]]:
+    """The factors of a kernel that sees the given columns of the whole inputs."""
+    if isinstance(kernel, SquaredExponential | Matern):
+        yield kernel, columns
+    elif isinstance(kernel, Columns):
+        yield from _stationary_factors(kernel.kernel, tuple(columns[i] for i in kernel.columns))
+    elif isinstance(kernel, Product):
+        for part in kernel.parts:
+            assert isinstance(part, Kernel)
+            yield from _stationary_factors(part, columns)
+    else:
+        raise TypeError(
+            f"sample paths need SquaredExponential or Matern kernels, or products, got "
+            f"{type(kernel).__name__}; "
+            "gp.joint(inputs) draws values at given inputs for any kernel"
+        )
+
+
 def _unit_frequencies(
-    kernel: SquaredExponential | Matern, count: int, dims: int, generator: torch.Generator
-) -> Float[Tensor, "F D"]:
+    kernel: SquaredExponential | Matern,
+    count: int,
+    batch_shape: torch.Size,
+    generators: Sequence[torch.Generator],
+) -> Float[Tensor, "*batch F d"]:
     """Frequencies from the spectrum of the kernel of unit length scales.
 
     Normal for a squared exponential; for Matérn ν Student's t of 2ν degrees of freedom: Rasmussen and
     Williams (2006), section 4.2.1.
     """
-    normal = torch.randn(count, dims, generator=generator, dtype=torch.float64)
-    if isinstance(kernel, SquaredExponential):
-        return normal
-    freedom = round(2 * kernel.smoothness)
-    square = torch.randn(count, freedom, generator=generator, dtype=torch.float64).square().sum(-1)
-    return normal * (freedom / square).sqrt().unsqueeze(-1)
+    drawn = _normal(generators, count, kernel.input_dim)
+    if isinstance(kernel, Matern):
+        freedom = round(2 * kernel.smoothness)
+        square = _normal(generators, count, freedom).square().sum(-1, keepdim=True)
+        drawn = drawn * (freedom / square).sqrt()
+    return drawn.reshape(*batch_shape, count, kernel.input_dim)
+
+
+def _normal(
+    generators: Sequence[torch.Generator], rows: int, columns: int
+) -> Float[Tensor, "G rows columns"]:
+    return torch.stack([torch.randn(rows, columns, generator=g, dtype=torch.float64) for g in generators])

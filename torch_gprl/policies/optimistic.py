@@ -12,6 +12,7 @@ where noise that is drawn at every step dithers; Auer (2002) for upper confidenc
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -24,7 +25,7 @@ from torch_gprl.gp.sample_paths import Paths, PathSampler
 from torch_gprl.policies.gaussian import explores
 from torch_gprl.policies.streams import NoiseStream, learner_generators
 
-ASCENT_STEPS = 4  # from the best candidate
+ASCENT_STEPS = 2  # from the best candidate
 
 
 class MaximisingPolicy(TensorDictModuleBase, ABC):
@@ -110,7 +111,7 @@ class ThompsonSampling(MaximisingPolicy):
     critic learns in the middle of an episode, the function is seen in the light of the new data.
 
     Args:
-        maximiser: of the critic's mean; its kernel is a squared exponential or a Matérn.
+        maximiser: of the critic's mean; with a kernel that `PathSampler` knows.
         seed: of the functions.
         learners: indices of the learners' streams.
         features: random frequencies of the prior's functions.
@@ -130,15 +131,16 @@ class ThompsonSampling(MaximisingPolicy):
         self._normal: Tensor | None = None
         self._paths: Paths | None = None
 
-    def get_extra_state(self) -> dict[str, Tensor]:
+    def get_extra_state(self) -> dict[str, Any]:
         """The present episodes' functions, for `state_dict`."""
         normal = torch.zeros(0) if self._normal is None else self._normal
-        return {"normal": normal, "frequencies": self.sampler.frequencies}
+        return {"normal": normal, "frequencies": [factor.frequencies for factor in self.sampler.factors]}
 
-    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+    def set_extra_state(self, state: dict[str, Any]) -> None:
         """Continue the functions of a `state_dict`."""
         self._normal = state["normal"] if state["normal"].numel() else None
-        self.sampler.frequencies = state["frequencies"]
+        saved = zip(self.sampler.factors, state["frequencies"], strict=True)
+        self.sampler.factors = [factor._replace(frequencies=frequencies) for factor, frequencies in saved]
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -150,9 +152,7 @@ class ThompsonSampling(MaximisingPolicy):
     def _begin(self, beginning: Tensor) -> None:
         """Draw new functions where an episode begins, [learners, E], and condition all on today's data."""
         # every learner draws at every step: what one draws must not depend on the episodes of others
-        fresh = self.noise.draw(
-            self.sampler.frequencies.new_empty(*beginning.shape, self.sampler.random_numbers)
-        )
+        fresh = self.noise.draw(self.maximiser.low.new_empty(*beginning.shape, self.sampler.random_numbers))
         kept = fresh if self._normal is None or self._normal.shape != fresh.shape else self._normal
         self._normal = torch.where(beginning.unsqueeze(-1), fresh, kept)
         self._paths = self.sampler.draw(

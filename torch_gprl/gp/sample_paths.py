@@ -79,7 +79,7 @@ class PathSampler:
 
     def values(self, paths: Paths, inputs: Float[Tensor, "*batch E P D"]) -> Float[Tensor, "*batch E P"]:
         """Each function at P inputs of its own, differentiable in them."""
-        flat, points = inputs.flatten(-3, -2), inputs.shape[-3:-1]
+        flat, points = inputs.to(self.gp.basis.dtype).flatten(-3, -2), inputs.shape[-3:-1]
         prior = self._features(flat).unflatten(-2, points)
         cross = self.gp._active().cross(flat).mT.unflatten(-2, points)
         return (prior @ paths.features.unsqueeze(-1) + cross @ paths.basis.unsqueeze(-1)).squeeze(-1)
@@ -109,9 +109,8 @@ def _stationary_factors(
             yield from _stationary_factors(part, columns)
     else:
         raise TypeError(
-            f"sample paths need SquaredExponential or Matern kernels, or products, got "
-            f"{type(kernel).__name__}; "
-            "gp.joint(inputs) draws values at given inputs for any kernel"
+            "sample paths need SquaredExponential or Matern kernels, or products, got "
+            f"{type(kernel).__name__}; gp.joint(inputs) draws values at given inputs for any kernel"
         )
 
 

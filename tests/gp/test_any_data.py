@@ -15,7 +15,7 @@ from torch_gprl.gp import SparseOnlineGP
 from torch_gprl.kernels import Matern, SquaredExponential
 
 EXAMPLES = settings(
-    max_examples=20, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+    max_examples=12, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
 )
 KERNELS = {"squared exponential": SquaredExponential, "matern": Matern}
 NO_POINTS = 0

@@ -27,6 +27,7 @@ from torch_gprl.learners.config import PolicyGradientConfig
 from torch_gprl.policies import GaussianPolicy
 
 FIT_POINTS = 160  # points of a rollout that a fit of hyper-parameters sees; its cost is cubic in them
+LEAST_FIT_POINTS = 8  # that a fit can be asked for
 TUNING_NODES = 60  # of a graph of basis vectors while its kernel is fitted
 FIRST_FIT, LATER_FITS = 50, 20  # steps of the optimiser: later fits start from the last
 GRAPH_FITS_SHORTER = 4  # times: a graph is searched anew at every step
@@ -124,9 +125,10 @@ class Teacher:
             steps //= GRAPH_FITS_SHORTER
         inputs = critic.inputs(points.get("observation"), points.get("action"))
         targets = critic.standard_targets(points.get("value_target"))
-        fit_hyperparameters(
-            critic.gp, _spread_over(inputs, FIT_POINTS), _spread_over(targets, FIT_POINTS), steps
-        )
+        if inputs.shape[1] >= LEAST_FIT_POINTS:  # fewer tell nothing: the first guess, or the last fit, stays
+            fit_hyperparameters(
+                critic.gp, _spread_over(inputs, FIT_POINTS), _spread_over(targets, FIT_POINTS), steps
+            )
         clear_graphs(critic)
 
     @staticmethod

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from torch_gprl.critics import GPActionValue
-from torch_gprl.critics.maximise import ActionMaximiser, ascend, candidate_actions
+from torch_gprl.critics.maximise import ActionMaximiser, ascend, candidate_actions, factorises
 from torch_gprl.gp import SparseOnlineGP
-from torch_gprl.kernels import Matern, SquaredExponential
+from torch_gprl.kernels import Columns, Kernel, Matern, SquaredExponential
 
 LEARNERS, STATES = 2, 12
 Function = Callable[[Tensor, Tensor], Tensor]
@@ -32,14 +32,17 @@ def rising(state: Tensor, action: Tensor) -> Tensor:
     return action.sum(-1) + state[..., 0]
 
 
-def fitted(function: Function, actions: int, kernel: type = SquaredExponential, points: int = 150):
+def fitted(
+    function: Function, actions: int, kernel: Callable[..., Kernel] = SquaredExponential, points: int = 150
+):
     """A critic that has learned the function on the box [−1, 1]^A."""
     generator = torch.Generator().manual_seed(0)
     data = 2 * torch.rand(LEARNERS, points, 1 + actions, generator=generator, dtype=torch.float64) - 1
     observation, action = data.split((1, actions), -1)
     target = function(observation, action).unsqueeze(-1)
     lengthscale = 0.7 if actions == 1 else 4.0  # standard deviations
-    process = SparseOnlineGP(kernel(1 + actions, lengthscale, batch_shape=(LEARNERS,)), points, 1e-6)
+    form = kernel(1 + actions, lengthscale, batch_shape=(LEARNERS,))
+    process = SparseOnlineGP(form, points, 1e-6)
     critic = GPActionValue(process)
     critic.standardise(observation, action, target)
     process.update(critic.inputs(observation, action), critic.standard_targets(target))
@@ -109,8 +112,23 @@ def test_one_dimension_agrees_with_a_fine_grid(kernel):
     assert close.double().mean() > 0.9  # near a tie the other peak may win
 
 
-def test_the_product_over_columns_equals_the_kernel_of_pairs():
-    critic = fitted(quadratic, 3)
+def by_columns(dims: int, lengthscale: float, batch_shape: tuple[int, ...]) -> Kernel:
+    """A Matérn kernel over states times one over actions."""
+    over_states = Matern(1, lengthscale, batch_shape=batch_shape, smoothness=2.5)
+    over_actions = SquaredExponential(dims - 1, lengthscale, 2.0, batch_shape)
+    return Columns(over_states, (0,), dims) * Columns(over_actions, range(1, dims), dims)
+
+
+def test_only_products_of_states_and_actions_factorise():
+    assert factorises(SquaredExponential(3), 2)
+    assert factorises(by_columns(3, 1.0, ()), 1)
+    assert not factorises(by_columns(3, 1.0, ()), 2)  # its second factor covers a state and an action
+    assert not factorises(Matern(3), 2)
+
+
+@pytest.mark.parametrize("kernel", [SquaredExponential, by_columns])
+def test_the_product_over_columns_equals_the_kernel_of_pairs(kernel):
+    critic = fitted(quadratic, 3, kernel)
     maximiser = ActionMaximiser(critic, *box(3), candidates=5)
     pairs = (LEARNERS, STATES, len(maximiser.candidates))
     spread = some_states().unsqueeze(-2).expand(*pairs, 1)

@@ -4,8 +4,9 @@ The posterior mean is compared at candidate actions that all states share, then 
 on a grid, by the vertex of the parabola through the best candidate and its neighbours; in more dimensions, on
 a scrambled Sobol sequence with the corners of the box, by projected gradient ascent from the best candidates.
 
-A squared exponential is a product over columns. With c_b(s) = α_b k(s, s_b) the candidates of all states then
-cost one matrix product, Q(s, a_j) = Σ_b c_b(s) k(a_j, a_b), instead of a kernel evaluation for each pair.
+Where the kernel is a product of one over states and one over actions, as a squared exponential is, the
+candidates of all states cost one matrix product, Q(s, a_j) = Σ_b c_b(s) k(a_j, a_b), c_b(s) = α_b k(s, s_b),
+instead of a kernel evaluation for each pair.
 """
 
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from torch_gprl.critics.action_value import GPActionValue
-from torch_gprl.kernels import SquaredExponential
+from torch_gprl.kernels import Kernel, Product, SquaredExponential
 
 MOST_CORNERS = 64  # of the box among the candidates: those of six dimensions; a box of more has none
 CHUNK = 2**22  # numbers of the largest temporary: bounds the memory
@@ -45,6 +46,14 @@ class Products(NamedTuple):
     def mean(self, alpha: Float[Tensor, "*batch B"]) -> Float[Tensor, "*batch N J"]:
         """Posterior mean of the process, in its own units, at all pairs of states and candidates."""
         return (self.states * alpha.unsqueeze(-2)) @ self.actions.mT
+
+
+def factorises(kernel: Kernel, states: int) -> bool:
+    """Whether k((s, a), (s', a')) = k(s, s') k(a, a') for the first `states` columns and the others."""
+    if isinstance(kernel, Product):
+        return all(factorises(part, states) for part in kernel.parts)
+    columns = kernel.active_columns
+    return isinstance(kernel, SquaredExponential) or max(columns) < states or min(columns) >= states
 
 
 def candidate_actions(
@@ -154,6 +163,8 @@ class ActionMaximiser:
         self.critic, self.starts, self.steps = critic, starts, steps
         self.low, self.high = low.to(like), high.to(like)
         self.candidates = candidate_actions(self.low, self.high, candidates)
+        kernel = critic.gp.kernel
+        self._factorises = factorises(kernel, kernel.input_dim - len(low))
         self.stride = 2 / candidates ** (1 / len(low))  # between candidates, in halves of the box
 
     @torch.no_grad()
@@ -188,10 +199,6 @@ class ActionMaximiser:
         size = max(1, CHUNK // each)
         return [slice(start, start + size) for start in range(0, max(points, 1), size)]
 
-    @property
-    def _factorises(self) -> bool:
-        return isinstance(self.critic.gp.kernel, SquaredExponential)
-
     def _maximise(self, states: Tensor, given: Tensor | None) -> Maximum:
         values = self.candidate_values(states)
         if not self.steps:
@@ -215,7 +222,7 @@ class ActionMaximiser:
     # ---------------------------------------------------------------- candidates
 
     def products(self, observation: Float[Tensor, "*batch N S"]) -> Products:
-        """Covariances of states and candidates with the basis, for a critic with a squared exponential."""
+        """Covariances of states and candidates with the basis, for a kernel that `factorises`."""
         critic, kernel = self.critic, self.critic.gp.kernel
         actions = len(self.low)
         nowhere = self.candidates.new_zeros(
@@ -225,7 +232,7 @@ class ActionMaximiser:
         seen = critic.inputs(observation, self.low.expand(*observation.shape[:-1], -1))
         state_columns = torch.arange(seen.shape[-1], device=seen.device) < seen.shape[-1] - actions
         basis = critic.gp.basis
-        # equal columns drop out of a squared exponential
+        # columns that are equal leave nothing of their factor but its variance
         by_state = kernel(seen * state_columns, basis * state_columns)
         by_action = kernel(tried * ~state_columns, basis * ~state_columns)
         return Products(by_state, by_action / kernel.diag(tried).unsqueeze(-1))

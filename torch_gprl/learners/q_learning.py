@@ -6,7 +6,8 @@ its own experience.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,11 +18,16 @@ from torchrl.envs import EnvBase
 from torch_gprl.critics import GPActionValue
 from torch_gprl.critics.maximise import ActionMaximiser
 from torch_gprl.gp import SparseOnlineGP
-from torch_gprl.kernels import SquaredExponential
+from torch_gprl.kernels import Columns, Kernel, Matern, SquaredExponential
 from torch_gprl.learners.collecting import Collection
 from torch_gprl.learners.q_learning_config import QLearningConfig
 from torch_gprl.learners.q_targets import FittedQ, OnlineQ
 from torch_gprl.policies import BehaviourPolicy
+
+KERNELS: dict[str, Callable[..., Kernel]] = {
+    "matern": partial(Matern, smoothness=2.5),
+    "squared-exponential": SquaredExponential,
+}
 
 
 class QLearning:
@@ -134,8 +140,9 @@ def make_critic(
     config: QLearningConfig, learners: int, states: int, low: Tensor, high: Tensor
 ) -> GPActionValue:
     """An empty critic, one Gaussian process for each learner."""
-    lengthscale = torch.full((states + len(low),), config.action_lengthscale, dtype=torch.float64)
-    lengthscale[:states] = config.lengthscale * math.sqrt(states)
-    kernel = SquaredExponential(states + len(low), lengthscale, batch_shape=(learners,))
+    dims, batch = states + len(low), (learners,)
+    over_states = KERNELS[config.kernel](states, config.lengthscale * math.sqrt(states), batch_shape=batch)
+    over_actions = SquaredExponential(len(low), config.action_lengthscale, batch_shape=batch)
+    kernel = Columns(over_states, range(states), dims) * Columns(over_actions, range(states, dims), dims)
     gp = SparseOnlineGP(kernel, config.budget, config.noise, config.novelty_threshold)
     return GPActionValue(gp, action_low=low, action_high=high).to(low.device)

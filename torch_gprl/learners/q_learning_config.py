@@ -7,13 +7,15 @@ from typing import Literal, get_args
 from torch_gprl.policies import Behaviour
 
 Targets = Literal["fitted", "online"]
+StateKernel = Literal["matern", "squared-exponential"]
+CHOICES = {"targets": Targets, "kernel": StateKernel}
 
 LEAST = {"total_frames": 1, "rollout_steps": 1, "budget": 1, "horizon": 1, "sweeps": 1, "candidates": 3}
 POSITIVE = ("noise", "lengthscale", "action_lengthscale", "novelty_threshold")
 SHARES = ("discount", "learning_rate", "growth")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class QLearningConfig(Behaviour):
     """Q-learning with a Gaussian process for the action value."""
 
@@ -23,17 +25,19 @@ class QLearningConfig(Behaviour):
 
     targets: Targets = "fitted"  # solve all experience anew, or the thesis' update of each rollout, once
     sweeps: int = 30  # most sweeps of value iteration in a solution; fitted
-    growth: float = 0.05  # share by which experience grows between solutions; fitted
+    growth: float = 0.1  # share by which experience grows between solutions; fitted
     learning_rate: float = 1.0  # step from the old value to the target, from 0 to 1; online
     horizon: int = 1  # real rewards before the maximum over actions, m of (.8); online
 
+    std: float = 0.6  # of the gaussian noise at first, in halves of the actuator's range
     candidates: int = 25  # actions compared in a maximisation
     optimism: float = 0.0  # what is not known is this many deviations of the value above its mean; fitted
 
     budget: int = 200  # basis vectors of the critic
     novelty_threshold: float = 0.3  # novelty that makes a point a basis vector, in noise variances
     noise: float = 1e-3  # noise variance of targets, in their variances
-    lengthscale: float = 0.5  # of observations, in their standard deviations times √columns
+    kernel: StateKernel = "matern"  # over states; Matérn 5/2 follows the ridges of values
+    lengthscale: float = 1.0  # of observations, in their standard deviations times √columns
     action_lengthscale: float = 3.0  # of actions, in halves of the actuator's range
 
     def __post_init__(self) -> None:
@@ -54,5 +58,7 @@ class QLearningConfig(Behaviour):
                 raise ValueError(f"{name} must lie between 0 and 1, got {getattr(self, name)}")
         if not math.isfinite(self.optimism):
             raise ValueError(f"optimism must be finite, got {self.optimism}")
-        if self.targets not in get_args(Targets):
-            raise ValueError(f"targets must be one of {', '.join(get_args(Targets))}, got {self.targets!r}")
+        for name, kind in CHOICES.items():
+            if getattr(self, name) not in get_args(kind):
+                choices = ", ".join(get_args(kind))
+                raise ValueError(f"{name} must be one of {choices}, got {getattr(self, name)!r}")

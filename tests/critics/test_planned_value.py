@@ -1,0 +1,133 @@
+"""Planned values against problems whose values are known in closed form."""
+
+import pytest
+import torch
+
+from torch_gprl.critics.planned_value import IMAGINED_STEPS, PlannedValue, Planning
+from torch_gprl.critics.transition_model import TransitionModel, Transitions
+
+BOUND = torch.ones(1, dtype=torch.float64)
+
+
+def walk(learners=2, steps=150, end=None, seed=0):
+    """A point on the line that moves by a tenth of the action and is paid −s² − 0.1 a²."""
+    generator = torch.Generator().manual_seed(seed)
+    state = torch.rand(learners, steps, 1, generator=generator, dtype=torch.float64)
+    state = -2 + state * (4 if end is None else 2 + end)  # nobody steps on from beyond the end
+    action = torch.rand(learners, steps, 1, generator=generator, dtype=torch.float64) * 2 - 1
+    following = state + 0.5 * action
+    reward = -(state.square() + 0.1 * action.square()).squeeze(-1)
+    terminated = torch.zeros_like(reward) if end is None else (following.squeeze(-1) > end).double()
+    return Transitions(state, action, reward, following, terminated)
+
+
+def planned(data, **numbers):
+    model = TransitionModel(len(data.reward), 1, 1, budget=100)
+    model.solve(data, fit=True)
+    value = PlannedValue(model, -BOUND, BOUND, Planning(**numbers), acting_actions=41)
+    columns = 1 + IMAGINED_STEPS
+    uniform = torch.rand(2, 100, columns, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    value.plan(data, uniform[: len(data.reward)])
+    return value
+
+
+def grid(count=9):
+    return torch.linspace(-1.5, 1.5, count, dtype=torch.float64).reshape(1, -1, 1).expand(2, -1, -1)
+
+
+def by_tables(discount, points=801):
+    """Value iteration for `walk` on a fine grid: states [points] and values."""
+    states = torch.linspace(-2.5, 2.5, points, dtype=torch.float64)
+    actions = torch.linspace(-1, 1, 41, dtype=torch.float64)
+    following = (states[:, None] + 0.5 * actions).clamp(-2.5, 2.5)
+    left = ((following + 2.5) / 5 * (points - 1)).floor().clamp(0, points - 2)
+    share = (following + 2.5) / 5 * (points - 1) - left
+    left = left.long()
+    values = torch.zeros_like(states)
+    for _ in range(300):
+        beyond = values[left] * (1 - share) + values[left + 1] * share
+        values = (-states[:, None].square() - 0.1 * actions.square() + discount * beyond).amax(1)
+    return states, values
+
+
+def test_the_model_predicts_steps_of_a_linear_system():
+    data = walk()
+    model = TransitionModel(2, 1, 1, budget=100)
+    model.solve(data, fit=True)
+    action = torch.full_like(grid(), 0.4)
+    step = model.predict(grid(), action)
+    torch.testing.assert_close(step.observation, grid() + 0.2, rtol=0, atol=1e-3)
+    expected = -(grid().square() + 0.1 * action.square()).squeeze(-1)
+    torch.testing.assert_close(step.reward, expected, rtol=0, atol=1e-2)
+    assert (step.doubt < 0.05).all()
+
+
+def test_doubt_grows_away_from_the_data():
+    near, far = torch.zeros(2, 1, 1, dtype=torch.float64), torch.full((2, 1, 1), 60.0, dtype=torch.float64)
+    model = TransitionModel(2, 1, 1, budget=100)
+    model.solve(walk(), fit=True)
+    assert (model.predict(far, near).doubt > model.predict(near, near).doubt + 0.1).all()
+
+
+def test_values_are_those_of_value_iteration_on_a_fine_table():
+    value = planned(walk(), discount=0.9)
+    states, values = by_tables(0.9)
+    best = value.best_action(grid(), explore=False)
+    found = value.action_values(grid(), best, explore=False)
+    index = ((grid().squeeze(-1) + 2.5) / 5 * (len(states) - 1)).round().long()
+    torch.testing.assert_close(found, values[index], rtol=0, atol=0.1 * float(values[index].std()))
+
+
+def test_the_best_action_leads_to_the_middle():
+    action = planned(walk(), discount=0.9).best_action(grid(), explore=False)
+    assert (action[:, :3] > 0.5).all()
+    assert (action[:, -3:] < -0.5).all()
+    assert (action[:, 4].abs() < 0.2).all()
+
+
+def test_an_end_is_worth_nothing_and_attracts_where_every_step_costs():
+    value = planned(walk(end=1.0), discount=0.9)
+    near = torch.full((2, 1, 1), 0.8, dtype=torch.float64)
+    assert (value.best_action(near, explore=False) > 0.3).all()  # one step of it ends all costs
+    over = torch.full_like(near, 1.0)
+    torch.testing.assert_close(
+        value.action_values(near, over, explore=False),
+        torch.full((2, 1), -(0.64 + 0.1), dtype=torch.float64),
+        rtol=0,
+        atol=0.1,
+    )
+
+
+def test_values_keep_to_the_attainable_range():
+    data = walk()
+    value = planned(data, discount=0.9)
+    far = torch.linspace(-30, 30, 13, dtype=torch.float64).reshape(1, -1, 1).expand(2, -1, -1)
+    found = value.action_values(far, torch.zeros_like(far), explore=False)
+    assert (found <= data.reward.max() + 0.9 * data.reward.amax(1, keepdim=True) / 0.1 + 1e-9).all()
+    assert (found >= data.reward.amin(1, keepdim=True) / 0.1 - 1e-9).all()
+
+
+def test_exploring_hopes_for_more_than_exploiting_and_most_where_nobody_was():
+    value = planned(walk(), discount=0.9)
+    still = torch.zeros(2, 1, 1, dtype=torch.float64)
+    hope = [
+        value.action_values(still + place, still, explore=True)
+        - value.action_values(still + place, still, explore=False)
+        for place in (0.0, 4.0)
+    ]
+    assert (hope[0] >= -1e-9).all()
+    assert (hope[1] > hope[0]).all()
+
+
+@pytest.mark.parametrize("learner", [0, 1])
+def test_learners_plan_apart(learner):
+    data = walk()
+    alone = Transitions(*(values[learner : learner + 1] for values in data))
+    together = planned(data).best_action(grid(), explore=False)[learner]
+    model = TransitionModel(1, 1, 1, budget=100)
+    model.solve(alone, fit=True)
+    value = PlannedValue(model, -BOUND, BOUND, Planning(), acting_actions=41)
+    uniform = torch.rand(2, 100, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    value.plan(alone, uniform[learner : learner + 1])
+    own = value.best_action(grid()[:1], explore=False)[0]
+    torch.testing.assert_close(own, together, rtol=0, atol=0.06)  # ties between neighbours may fall apart

@@ -1,0 +1,301 @@
+"""State values by dynamic programming on a learned model of the steps.
+
+Gaussian-process dynamic programming (Deisenroth, Rasmussen and Peters, 2009): the value is a Gaussian process
+on support states, and each sweep sets it there to
+
+    V(s) = max_a r̂(s, a) + γ (1 − end(ŝ')) V(ŝ'),   ŝ' the model's prediction
+
+The process has a Matérn 1/2 kernel. Its predictions are nearly convex combinations of the values at the
+support, so sweeps nearly contract; a smoother kernel overshoots and the maximum then feeds on it. Values also
+keep to the attainable range. Support states are visited ones, states a few imagined steps away, and the ends
+that were seen, whose value is zero.
+
+A second value, for exploration, takes what the model does not know for the best attainable (optimism in the
+face of uncertainty): a share `doubt` of the backup is the highest value there is.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torch_gprl.critics.maximise import candidate_actions
+from torch_gprl.critics.transition_model import TransitionModel, Transitions
+from torch_gprl.gp import Posterior
+from torch_gprl.gp.regression import farthest_points
+from torch_gprl.kernels import Kernel, Matern, SquaredExponential
+from torch_gprl.linalg import cholesky
+
+EXPLOIT, EXPLORE = 0, 1  # columns of the values
+VALUE_NOISE, LABEL_NOISE, NOVELTY_NOISE = 1e-3, 1e-3, 1e-2  # of regressions under kernels of variance 1
+IMAGINED_STEPS = 2  # from a known state to an imagined one
+FIRST_SWEEPS = 3  # times as many as later: those begin from the last value
+MOST_ENDS = 50  # ends among the support
+NOWHERE = 1e6  # scaled coordinate of the places that a learner with fewer ends leaves empty
+CHUNK = 2**22  # numbers of the largest temporary: bounds the memory
+
+
+@dataclass(frozen=True)
+class Planning:
+    """The numbers of a plan."""
+
+    discount: float = 0.98  # γ per environment step
+    support: int = 200  # states whose values are planned, besides ends
+    imagined: int = 300  # imagined states that the support is chosen from, besides visited ones
+    sweeps: int = 40  # of value iteration, in each plan
+    backup_actions: int = 9  # actions compared in a sweep
+    lengthscale: float = 2.0  # of values, in the observations' standard deviations times √columns
+    novelty_lengthscale: float = 0.5  # in which a state counts as new, likewise
+    optimism: float = 1.0  # share of what the doubt is worth, when exploring
+
+
+class _Support(NamedTuple):
+    """Where values are known, in standardised and scaled coordinates, and what they are."""
+
+    observation: Tensor  # [L, M, S] states, without the ends
+    scaled: Tensor  # [L, M + E, S] with the ends
+    ends: Tensor  # [L, E] 1 for an end, 0 for an empty place
+    loc: Tensor  # [L, 1, S] of the scaling
+    scale: Tensor  # [L, 1, S]
+    prior: Tensor  # [L, 1, 2] mean of the values where nothing is known
+    weights: Tensor  # [L, M + E, 2]
+
+
+class _Seen(NamedTuple):
+    """Visited states, their labels as ends, and what judges new ones."""
+
+    scaled: Tensor  # [L, R, S]
+    labels: Tensor  # [L, R]
+    label_weights: Tensor  # [L, R, 1]
+    novelty_factor: Tensor  # [L, R, R]
+
+
+class PlannedValue:
+    """Values and action values of learners, planned on their models.
+
+    Args:
+        model: predicts steps.
+        low: lower bounds of the actions, [A], in the actuator's units.
+        high: upper bounds.
+        planning: the numbers.
+        acting_actions: actions compared when acting.
+    """
+
+    def __init__(
+        self, model: TransitionModel, low: Tensor, high: Tensor, planning: Planning, acting_actions: int
+    ) -> None:
+        self.model, self.planning = model, planning
+        self._centre, self._half = (low + high) / 2, (high - low) / 2
+        self._backup_actions = self._candidates(low, high, planning.backup_actions)
+        self._acting_actions = self._candidates(low, high, acting_actions)
+        self._support: _Support | None = None
+
+    def _candidates(self, low: Tensor, high: Tensor, count: int) -> Tensor:
+        return (candidate_actions(low, high, count) - self._centre) / self._half
+
+    @property
+    def planned(self) -> bool:
+        """Whether there is a plan."""
+        return self._support is not None
+
+    # ---------------------------------------------------------------- planning
+
+    @torch.no_grad()
+    def plan(self, data: Transitions, uniform: Float[Tensor, "L I U"]) -> None:
+        """Plan anew on the model's present beliefs, from the last plan's values.
+
+        Args:
+            data: the experience that the model has learned.
+            uniform: numbers in [0, 1) that choose imagined states: which known state each begins from, and
+                the actions that lead there: U = 1 + 2 A columns.
+        """
+        before = self._support
+        kernels = self._kernels(data.observation)
+        self._judge(data, kernels)
+        observation = self._choose(data, uniform)
+        scaled, ends = self._with_ends(self._scaled(observation))
+        self._bound(data)
+        average = (self._low + self._high) / 2
+        values = average.unsqueeze(-1).expand(*observation.shape[:2], 2)
+        if before is not None:
+            values = self._values_of(before, observation)
+            average = values[..., EXPLOIT].mean(1, keepdim=True)
+        prior = torch.stack([average, self._high], -1)
+        none = torch.zeros_like(prior.expand(-1, scaled.shape[1], -1))
+        loc, scale = self.model.loc, self.model.scale
+        self._support = _Support(observation, scaled, ends, loc, scale, prior, none)
+        self._iterate(values, self.planning.sweeps * (1 if before is not None else FIRST_SWEEPS))
+
+    def _kernels(self, like: Tensor) -> tuple[Kernel, Kernel]:
+        """Of values and of novelty, in scaled coordinates, where the length scale of values is 1."""
+        columns = like.shape[-1]
+        narrow = self.planning.novelty_lengthscale / self.planning.lengthscale
+        self._kernel = Matern(columns, smoothness=0.5).to(like).requires_grad_(False)
+        self._novelty_kernel = SquaredExponential(columns, narrow).to(like).requires_grad_(False)
+        return self._kernel, self._novelty_kernel
+
+    def _scaled(self, observation: Tensor) -> Tensor:
+        unit = self.planning.lengthscale * math.sqrt(observation.shape[-1])
+        return (observation - self.model.loc) / (self.model.scale * unit)
+
+    def _judge(self, data: Transitions, kernels: tuple[Kernel, Kernel]) -> None:
+        """Learn from all visited states where the task ends, and what is new."""
+        visited = self._scaled(torch.cat([data.observation, data.following], 1))
+        labels = torch.cat([torch.zeros_like(data.terminated), data.terminated], 1)
+        chosen = farthest_points(visited, self.planning.support)
+        scaled = visited.take_along_dim(chosen.unsqueeze(-1), 1)
+        labels = labels.gather(1, chosen)
+        eye = torch.eye(scaled.shape[1], dtype=scaled.dtype, device=scaled.device)
+        factor = cholesky(kernels[0](scaled, scaled) + LABEL_NOISE * eye)
+        weights = torch.cholesky_solve(labels.unsqueeze(-1), factor)
+        novelty_factor = cholesky(kernels[1](scaled, scaled) + NOVELTY_NOISE * eye)
+        self._seen = _Seen(scaled, labels, weights, novelty_factor)
+        self._task_ends = bool(labels.any())
+
+    def _end(self, observation: Tensor) -> Float[Tensor, "L N"]:
+        """How far observations look like ends of the task, 0 to 1."""
+        if not self._task_ends:
+            return torch.zeros_like(observation[..., 0])
+        cross = self._kernel(self._scaled(observation), self._seen.scaled)
+        return (cross @ self._seen.label_weights).squeeze(-1).clamp(0, 1)
+
+    def _novelty(self, observation: Tensor) -> Float[Tensor, "L N"]:
+        """How little observations look like visited states, 0 to 1."""
+        cross = self._novelty_kernel(self._seen.scaled, self._scaled(observation))
+        known = torch.linalg.solve_triangular(self._seen.novelty_factor, cross, upper=False)
+        return (1 - known.square().sum(-2)).clamp(0, 1)
+
+    def _choose(self, data: Transitions, uniform: Tensor) -> Float[Tensor, "L M S"]:
+        """Support states that cover visited and imagined ones, none of them an end."""
+        visited = data.observation
+        known = visited if self._support is None else torch.cat([visited, self._support.observation], 1)
+        start = (uniform[..., 0] * known.shape[1]).long()
+        imagined = known.take_along_dim(start.unsqueeze(-1), 1)
+        for action in (2 * uniform[..., 1:] - 1).chunk(IMAGINED_STEPS, -1):
+            imagined = self.model.predict(imagined, action, doubt=False).observation
+        pool = torch.cat([known, imagined], 1)
+        over = (self._end(pool) > 0.5).unsqueeze(-1)
+        pool = torch.where(over, visited[:, -1:], pool)  # visited states that are no ends fill the places
+        chosen = farthest_points(self._scaled(pool), self.planning.support)
+        return pool.take_along_dim(chosen.unsqueeze(-1), 1)
+
+    def _with_ends(self, scaled: Tensor) -> tuple[Tensor, Tensor]:
+        """Support states in scaled coordinates followed by ends; and which of those are."""
+        if not self._task_ends:
+            return scaled, scaled.new_zeros(len(scaled), 0)
+        ends, places = self._seen.labels.topk(min(MOST_ENDS, self._seen.labels.shape[1]), 1)
+        where = self._seen.scaled.take_along_dim(places.unsqueeze(-1), 1)
+        where = torch.where(ends.unsqueeze(-1) > 0.5, where, NOWHERE)
+        return torch.cat([scaled, where], 1), ends
+
+    def _bound(self, data: Transitions) -> None:
+        """The attainable range of values [L, 1]: rewards for ever, or until an end."""
+        low, high = data.reward.amin(1, keepdim=True), data.reward.amax(1, keepdim=True)
+        ends = data.terminated.any(1, keepdim=True)
+        horizon = 1 - self.planning.discount
+        self._low = torch.where(ends, low.clamp_max(0), low) / horizon
+        self._high = torch.where(ends, high.clamp_min(0), high) / horizon
+
+    def _iterate(self, values: Tensor, sweeps: int) -> None:
+        """Value iteration at the support."""
+        support, actions = self._support, self._backup_actions
+        assert support is not None
+        learners, count, _ = support.observation.shape
+        spread = support.observation.repeat_interleave(len(actions), 1)
+        step = self.model.predict(spread, actions.repeat(count, 1).expand(learners, -1, -1))
+        lasting = self.planning.discount * (1 - self._end(step.observation))
+        unknown = self._unknown(step.observation, step.doubt, lasting)
+        cross = self._kernel(self._scaled(step.observation), support.scaled)
+        eye = torch.eye(support.scaled.shape[1], dtype=cross.dtype, device=cross.device)
+        factor = cholesky(self._kernel(support.scaled, support.scaled) + VALUE_NOISE * eye)
+        for _ in range(sweeps):
+            weights = torch.cholesky_solve(self._residual(values), factor)
+            beyond = torch.clamp(cross @ weights + support.prior, self._low[..., None], self._high[..., None])
+            backup = step.reward.unsqueeze(-1) + lasting.unsqueeze(-1) * beyond
+            backup = torch.lerp(backup, self._high[..., None].expand_as(backup), unknown)
+            values = backup.unflatten(1, (count, -1)).amax(2)
+        weights = torch.cholesky_solve(self._residual(values), factor)
+        self._support = support._replace(weights=weights)
+
+    def _residual(self, values: Tensor) -> Tensor:
+        """Values at the support less their prior mean; at ends the value is zero."""
+        support = self._support
+        assert support is not None
+        at_ends = torch.where(
+            support.ends.unsqueeze(-1) > 0.5, -support.prior, torch.zeros_like(support.prior)
+        )
+        return torch.cat([values - support.prior, at_ends.expand(-1, support.ends.shape[1], -1)], 1)
+
+    def _unknown(self, following: Tensor, doubt: Tensor, lasting: Tensor) -> Float[Tensor, "L N 2"]:
+        """Share of a backup that is not known, for both values; zero for the one that exploits."""
+        new = torch.maximum(doubt, self._novelty(following) * lasting / self.planning.discount)
+        return torch.stack([torch.zeros_like(new), (self.planning.optimism * new).clamp(max=1.0)], -1)
+
+    def _values_of(self, support: _Support, observation: Tensor) -> Float[Tensor, "L N 2"]:
+        unit = self.planning.lengthscale * math.sqrt(observation.shape[-1])
+        scaled = (observation - support.loc) / (support.scale * unit)
+        values = self._kernel(scaled, support.scaled) @ support.weights + support.prior
+        return torch.clamp(values, self._low[..., None], self._high[..., None])
+
+    # ---------------------------------------------------------------- acting
+
+    @torch.no_grad()
+    def action_values(
+        self, observation: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"], explore: bool
+    ) -> Float[Tensor, "L N"]:
+        """r̂ + γ V(ŝ') of actions in halves of the actuator's range."""
+        assert self._support is not None
+        step = self.model.predict(observation, action, doubt=explore)
+        lasting = self.planning.discount * (1 - self._end(step.observation))
+        column = EXPLORE if explore else EXPLOIT
+        value = step.reward + lasting * self._values_of(self._support, step.observation)[..., column]
+        if not explore:
+            return value
+        unknown = self._unknown(step.observation, step.doubt, lasting)[..., EXPLORE]
+        return torch.lerp(value, self._high.expand_as(value), unknown)
+
+    @torch.no_grad()
+    def best_action(self, observation: Float[Tensor, "L N S"], explore: bool) -> Float[Tensor, "L N A"]:
+        """The best of the candidate actions, in halves of the actuator's range."""
+        actions = self._acting_actions
+        each = len(observation) * len(actions) * (self.model.budget + self.planning.support)
+        best = []
+        for some in observation.split(max(1, CHUNK // each), 1):
+            spread = some.repeat_interleave(len(actions), 1)
+            tried = actions.repeat(some.shape[1], 1).expand(len(some), -1, -1)
+            value = self.action_values(spread, tried, explore)
+            best.append(actions[value.unflatten(1, (some.shape[1], -1)).argmax(-1)])
+        return torch.cat(best, 1)
+
+    def value(self, observation: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"]) -> Posterior:
+        """Action values [L, N] of actions in the actuator's units, in units of the return.
+
+        The variance is what the model's doubt is worth: that share of the squared attainable range.
+        """
+        observation = observation.to(self.model.loc.dtype)
+        share = (action.to(observation) - self._centre) / self._half
+        mean = self.action_values(observation, share, explore=False)
+        step = self.model.predict(observation, share)
+        unknown = torch.maximum(step.doubt, self._novelty(step.observation))
+        return Posterior(mean, unknown * (self._high - self._low).square())
+
+    def basis_states(self, learner: int) -> Float[Tensor, "M S"]:
+        """The support states of a learner, as observations."""
+        assert self._support is not None
+        return self._support.observation[learner]
+
+    # ---------------------------------------------------------------- keeping
+
+    def state_dict(self) -> dict[str, Any]:
+        """The plan; what judges states follows from the experience that was planned on."""
+        return {} if self._support is None else self._support._asdict()
+
+    def load_state_dict(self, state: dict[str, Any], data: Transitions) -> None:
+        """Take up what `state_dict` gave, with the experience that was planned on."""
+        if state:
+            self._judge(data, self._kernels(data.observation))
+            self._bound(data)
+            self._support = _Support(**state)

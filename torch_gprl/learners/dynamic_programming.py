@@ -1,0 +1,214 @@
+"""Dynamic programming on Gaussian-process models: the learner for the least experience.
+
+One update: act for a rollout on the plan that is optimistic about what is unknown, add it to the experience,
+and, when that has grown enough, learn the model and plan anew. All learners at once, each on its own
+experience. Model-based: where the other learners estimate values from the rewards that followed, this one
+learns what each step does and computes what follows (Deisenroth, Rasmussen and Peters, 2009).
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torch_gprl.critics.planned_value import IMAGINED_STEPS, PlannedValue
+from torch_gprl.critics.transition_model import TransitionModel, Transitions
+from torch_gprl.learners.collecting import Collection
+from torch_gprl.learners.dynamic_programming_config import DynamicProgrammingConfig
+from torch_gprl.learners.q_learning import action_box_of
+from torch_gprl.policies.gaussian import explores
+from torch_gprl.policies.streams import NoiseStream, learner_generators, stacked_normal
+
+INERTIA = 0.8  # of the first, random actions: those that follow each other are alike, and move the robot
+REFIT_GROWTH = 2  # hyper-parameters are fitted whenever the experience has doubled
+
+
+class PlannedPolicy(TensorDictModuleBase):
+    """The best action of a plan, with a little noise; smooth random actions as long as there is none.
+
+    Reads `observation` [L, envs, S], writes `action`. Under TorchRL's `ExplorationType.DETERMINISTIC` it acts
+    on the plan that does not count on the unknown, without noise.
+
+    Args:
+        value: the plan.
+        low: lower bounds of the actions, [A].
+        high: upper bounds.
+        std: of the noise, in halves of the actuator's range.
+        seed: of the noise.
+        learners: indices of the learners' streams.
+    """
+
+    def __init__(
+        self, value: PlannedValue, low: Tensor, high: Tensor, std: float, seed: int, learners: Sequence[int]
+    ) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = ["observation"], ["action"]
+        self.std, self.noise = std, NoiseStream(seed, learners)
+        self._value, self._centre, self._half = value, (low + high) / 2, (high - low) / 2
+        self._last: Tensor | None = None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        observation = tensordict.get("observation")
+        states = observation.to(self._half.dtype).reshape(len(observation), -1, observation.shape[-1])
+        share = self._share(states).reshape(*observation.shape[:-1], -1)
+        return tensordict.set("action", (self._centre + share * self._half).to(observation.dtype))
+
+    def _share(self, states: Tensor) -> Tensor:
+        nothing = states.new_zeros(*states.shape[:2], len(self._half))
+        if not explores():
+            return self._value.best_action(states, explore=False) if self._value.planned else nothing
+        noise = self.noise.draw(nothing)
+        if self._value.planned:
+            best = self._value.best_action(states, explore=True)
+            return torch.clamp(best + self.std * noise, -1, 1)
+        last = nothing if self._last is None else self._last
+        self._last = torch.clamp(INERTIA * last + (1 - INERTIA**2) ** 0.5 * noise, -1, 1)
+        return self._last
+
+    def state(self) -> dict[str, Any]:
+        """Where the noise stands, for `restore`."""
+        return {"noise": self.noise.state(), "last": self._last}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue where the noise stood."""
+        self.noise.restore(state["noise"])
+        self._last = state["last"]
+
+
+class DynamicProgramming:
+    """Learns models of the steps, one for each learner of `env`, and acts on plans made with them.
+
+    Args:
+        env: environment of batch [learners, environments] with a bounded action.
+        config: numbers of the algorithm.
+        seed: of the exploration and of imagined states, learner by learner.
+        first_learner: index of the first learner in those streams.
+    """
+
+    def __init__(
+        self, env: EnvBase, config: DynamicProgrammingConfig, seed: int = 0, first_learner: int = 0
+    ) -> None:
+        if len(env.batch_size) != 2:
+            raise ValueError(
+                f"the environment's batch must be [learners, environments], got {tuple(env.batch_size)}"
+            )
+        self.env, self.config = env, config
+        self.learners, num_envs = env.batch_size
+        states = env.observation_spec["observation"].shape[-1]
+        low, high = action_box_of(env)
+        indices = range(first_learner, first_learner + self.learners)
+        self.model = TransitionModel(self.learners, states, len(low), config.model_budget)
+        self.critic = PlannedValue(self.model, low, high, config.planning, config.acting_actions)
+        self.policy = PlannedPolicy(self.critic, low, high, config.std, seed, indices)
+        self.collection = Collection(env, self.policy, config.rollout_steps)
+        self.frames_per_update = num_envs * config.rollout_steps
+        self.total_updates = -(-config.total_frames // self.frames_per_update)
+        self.updates = 0
+        self._centre, self._half = (low + high) / 2, (high - low) / 2
+        self._imagination = learner_generators(seed, indices, "weights")
+        self._experience: Transitions | None = None
+        self._planned, self._fitted = 0, 0  # steps of experience at the last plan and the last fit
+        self._last_return = torch.full((self.learners,), torch.nan, device=env.device)
+
+    @property
+    def frames(self) -> int:
+        """Environment steps per learner so far."""
+        return self.updates * self.frames_per_update
+
+    def train(self) -> Iterator[dict[str, Tensor]]:
+        """Run the remaining updates; yields figures of each, [learners] every one."""
+        while self.updates < self.total_updates:
+            rollout = self.collection.rollout()
+            new = self._transitions(rollout)
+            error = self._surprise(new)
+            self._remember(new)
+            self._plan()
+            self.updates += 1
+            yield self._figures(rollout) | {"model_error": error}
+
+    def _transitions(self, rollout: TensorDictBase) -> Transitions:
+        """The rollout's steps, [L, envs · T], in time order."""
+        observation = rollout.get("observation")
+
+        def flat(value: Tensor) -> Tensor:
+            return value.to(self._half.dtype).transpose(1, 2).flatten(1, 2)
+
+        following = rollout.get("next")
+        return Transitions(
+            flat(observation),
+            (flat(rollout.get("action")) - self._centre) / self._half,
+            flat(following.get("reward")).squeeze(-1),
+            flat(following.get("observation")),
+            flat(following.get("terminated")).squeeze(-1),
+        )
+
+    def _remember(self, new: Transitions) -> None:
+        old = self._experience
+        if old is not None:
+            new = Transitions(*(torch.cat(pair, 1) for pair in zip(old, new, strict=True)))
+        self._experience = new
+
+    def _plan(self) -> None:
+        """Learn the model and plan, if the experience has grown enough."""
+        data, config = self._experience, self.config
+        assert data is not None
+        steps = data.reward.shape[1]
+        if steps < config.first_steps or steps < (1 + config.growth) * self._planned:
+            return
+        fit = steps >= REFIT_GROWTH * self._fitted
+        self.model.solve(data, fit)
+        self._planned, self._fitted = steps, steps if fit else self._fitted
+        columns = 1 + IMAGINED_STEPS * len(self._half)
+        draws = stacked_normal(self._imagination, (config.imagined, columns)).to(data.reward)
+        self.critic.plan(data, torch.special.ndtr(draws))
+
+    def _surprise(self, new: Transitions) -> Tensor:
+        """Root mean square error of the predicted reward on steps that the model has not seen [L]."""
+        if not self.critic.planned:
+            return torch.full((self.learners,), torch.nan, device=new.reward.device)
+        predicted = self.model.predict(new.observation, new.action, doubt=False).reward
+        return (predicted - new.reward).square().mean(1).sqrt()
+
+    def _figures(self, rollout: TensorDictBase) -> dict[str, Tensor]:
+        ended = rollout.get(("next", "done")).squeeze(-1).flatten(1)
+        returns = rollout.get(("next", "episode_reward")).squeeze(-1).flatten(1)
+        mean = (returns * ended).sum(1) / ended.sum(1)
+        # no episode ended: the last known
+        self._last_return = torch.where(ended.any(1), mean, self._last_return)
+        return {"return": self._last_return}
+
+    def state_dict(self) -> dict[str, Any]:
+        """What was experienced and planned, and where the random streams stand: tensors and numbers."""
+        return {
+            "updates": self.updates,
+            "planned": self._planned,
+            "fitted": self._fitted,
+            "experience": None if self._experience is None else self._experience._asdict(),
+            "model": self.model.state_dict(),
+            "plan": self.critic.state_dict(),
+            "imagination": torch.stack([generator.get_state() for generator in self._imagination]),
+            "collection": self.collection.state_dict(),
+            "policy": self.policy.state(),
+            "last_return": self._last_return,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what `state_dict` gave."""
+        self.updates, self._planned, self._fitted = state["updates"], state["planned"], state["fitted"]
+        self.model.load_state_dict(state["model"])
+        if state["experience"] is not None:
+            self._experience = Transitions(**state["experience"])
+            planned_on = Transitions(*(values[:, : self._planned] for values in self._experience))
+            if self._planned:
+                self.model.solve(planned_on, fit=False)
+                self.critic.load_state_dict(state["plan"], planned_on)
+        for generator, saved in zip(self._imagination, state["imagination"], strict=True):
+            generator.set_state(saved.clone())
+        self.collection.load_state_dict(state["collection"])
+        self.policy.restore(state["policy"])
+        self._last_return = state["last_return"]

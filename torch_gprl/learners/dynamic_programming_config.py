@@ -1,0 +1,75 @@
+"""The numbers of dynamic programming on a learned model, each with its unit: they become the command line."""
+
+import math
+from dataclasses import dataclass
+
+from torch_gprl.critics.planned_value import Planning
+
+LEAST = {
+    "total_frames": 1,
+    "rollout_steps": 1,
+    "first_steps": 2,
+    "model_budget": 1,
+    "support": 1,
+    "imagined": 0,
+    "sweeps": 1,
+    "backup_actions": 3,
+    "acting_actions": 3,
+}
+POSITIVE = ("lengthscale", "novelty_lengthscale")
+NOT_NEGATIVE = ("std", "optimism", "growth")
+
+
+@dataclass(frozen=True)
+class DynamicProgrammingConfig:
+    """Dynamic programming on Gaussian-process models of the steps and of the value."""
+
+    total_frames: int = 2_000  # environment steps per learner, over all its environments
+    rollout_steps: int = 25  # steps of each environment between two looks at the plan
+    first_steps: int = 50  # environment steps per learner of random actions, before the first plan
+    growth: float = 0.05  # share by which experience grows between plans
+    discount: float = 0.98  # γ per environment step, from 0 to 1, 1 excluded
+
+    model_budget: int = 200  # basis vectors of the model of the steps
+    support: int = 200  # states whose values are planned
+    imagined: int = 300  # imagined states that the support is chosen from, besides visited ones
+    sweeps: int = 40  # of value iteration in each plan
+    backup_actions: int = 9  # actions compared in a sweep
+    acting_actions: int = 21  # actions compared when acting
+    lengthscale: float = 2.0  # of values, in standard deviations of the observations times √columns
+    novelty_lengthscale: float = 0.5  # in which a state counts as new, likewise
+
+    optimism: float = 1.0  # share of what doubt is worth when exploring; 0 trusts the model
+    std: float = 0.1  # standard deviation of noise round the best action, in halves of the actuator's range
+
+    def __post_init__(self) -> None:
+        """Refuse numbers out of range.
+
+        Raises:
+            ValueError: naming the field, its value and what would be valid.
+        """
+        for name, least in LEAST.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        for name in POSITIVE:
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in NOT_NEGATIVE:
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be at least 0 and finite, got {getattr(self, name)}")
+        if not 0 <= self.discount < 1:
+            raise ValueError(f"discount must be at least 0 and below 1, got {self.discount}")
+
+    @property
+    def planning(self) -> Planning:
+        """The numbers of a plan."""
+        return Planning(
+            self.discount,
+            self.support,
+            self.imagined,
+            self.sweeps,
+            self.backup_actions,
+            self.lengthscale,
+            self.novelty_lengthscale,
+            self.optimism,
+        )

@@ -105,6 +105,18 @@ def test_a_replay_keeps_the_newest_transitions_and_the_critic_knows_no_others():
         assert figures["outdated"].shape == (2,)
 
 
+def test_improvements_move_the_policy_by_what_is_remembered():
+    moved = {}
+    for improvements in (0, 3):
+        numbers = {"estimator": "all-action", "targets": "differences", "replay": 100}
+        made = learner(updates=1, improvements=improvements, **numbers)
+        (figures,) = made.train()
+        assert figures["gradient_norm"].shape == (2,)
+        moved[improvements] = torch.cat([p.detach().flatten(1) for p in made.controller.parameters()], 1)
+        assert (made.critic.gp.observations == 100).all()
+    assert ((moved[3] - moved[0]).norm(dim=1) > 0.1).all()
+
+
 def test_a_critic_renewed_at_every_update_has_nothing_out_of_date():
     renewed = [figures["outdated"] for figures in learner(3, renew_every=1).train()]
     kept = [figures["outdated"] for figures in learner(6, renew_every=1000, novelty_threshold=1e-4).train()]
@@ -129,7 +141,7 @@ DIFFERENCES = {"targets": "differences", "estimator": "all-action"}
 
 
 @pytest.mark.parametrize(
-    "numbers", [DIFFERENCES, DIFFERENCES | {"replay": 150}, {"critic": "neural"}], ids=str
+    "numbers", [DIFFERENCES, DIFFERENCES | {"replay": 150, "improvements": 1}, {"critic": "neural"}], ids=str
 )
 def test_a_saved_run_goes_on_as_it_would_have(numbers):
     numbers = {"updates": 4, **numbers}
@@ -153,6 +165,7 @@ def test_a_saved_run_goes_on_as_it_would_have(numbers):
         ({"kernel": "linear"}, "kernel must be one of squared-exponential, matern-1/2"),
         ({"kernel": "successor", "discount": 1.0}, "'successor' needs a discount between 0 and 1, got 1.0"),
         ({"replay": 100}, "needs targets 'differences'"),
+        ({"improvements": 2}, "improvements need a replay, estimator 'all-action'"),
         ({"replay": -1}, "replay must be at least 0"),
         ({"age_weight": 1.5}, "age_weight must lie between 0 and 1, got 1.5"),
         ({"noise": 0.0}, "noise must be positive"),

@@ -44,6 +44,7 @@ LEAST = {
     "renew_every": 1,
     "horizon": 0,
     "replay": 0,
+    "improvements": 0,
 }
 POSITIVE = (
     "std",
@@ -93,6 +94,7 @@ class PolicyGradientConfig:
     novelty_threshold: float = 0.3  # novelty that makes a point a basis vector, in noise variances
     renew_every: int = 20  # policy updates between renewals of the critic, which forget older data; 1: each
     replay: int = 0  # environment steps per learner, solved anew at each update; differences only, 0 is off
+    improvements: int = 0  # further steps at each update, by the critic at replayed states; with "all-action"
     noise: float = 0.02  # noise variance of temporal differences, in variances of the reward
     lengthscale: float = 0.3  # of observations, in their standard deviations times √columns; differences
     action_lengthscale: float = 12.0  # of actions, in their standard deviations; differences
@@ -124,6 +126,11 @@ class PolicyGradientConfig:
     def _check_combinations(self) -> None:
         if self.replay and self.targets != "differences":
             raise ValueError("replay solves temporal differences anew and needs targets 'differences'")
+        if self.improvements and (not self.replay or self.estimator != "all-action" or self.discount_states):
+            raise ValueError(
+                "improvements need a replay, estimator 'all-action' and discount_states off, got replay "
+                f"{self.replay}, {self.estimator!r} and {self.discount_states}"
+            )
         if self.kernel in ("geodesic", "successor") and not 0 < self.discount < 1:
             raise ValueError(f"kernel {self.kernel!r} needs a discount between 0 and 1, got {self.discount}")
         if self.critic == "neural" and self.estimator not in BY_STATE_VALUES:

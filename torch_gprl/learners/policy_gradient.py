@@ -151,6 +151,8 @@ class PolicyGradient:
             step = self._step_policy(rollout)
             if not taught:
                 self.teacher.teach(rollout, self.updates)
+            for _ in range(self.config.improvements):
+                self._improve()
             self.updates += 1
             yield self._figures(rollout, seen) | step
 
@@ -174,8 +176,23 @@ class PolicyGradient:
 
     def _step_policy(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """One step along the gradient of all learners; figures of each one's gradient."""
-        parameters, left = self._trained(), 1 - self.updates / self.total_updates
+        parameters = self._trained()
         figures = self._differentiate(rollout, parameters)
+        self._move(rollout, parameters)
+        self._anneal((self.updates + 1) / self.total_updates)
+        return figures
+
+    def _improve(self) -> None:
+        """One more step without new experience: the critic solved anew, all actions at remembered states."""
+        assert isinstance(self.teacher, Teacher)
+        remembered, parameters = self.teacher.solve_anew(self.updates), self._trained()
+        self.optimiser.zero_grad()
+        self.losses[-1](remembered)["loss_all_action"].backward()
+        self._move(remembered, parameters)
+
+    def _move(self, rollout: TensorDictBase, parameters: list[torch.nn.Parameter]) -> None:
+        """Step along the gradient that is set, at states of the rollout."""
+        left = 1 - self.updates / self.total_updates
         if self.config.optimiser == "natural":
             natural_step(parameters, self._divergence(rollout), self.config.trust_region * left)
         elif self.config.optimiser == "episodic-natural":
@@ -184,8 +201,6 @@ class PolicyGradient:
         else:
             self.optimiser.param_groups[0]["lr"] = self.config.learning_rate * left
             self.optimiser.step()
-        self._anneal((self.updates + 1) / self.total_updates)
-        return figures
 
     def _anneal(self, done: float) -> None:
         """Set what changes in the exploration by a schedule, for a share of the training that is over."""

@@ -93,8 +93,15 @@ class Teacher:
             self.critic.update_differences(rollout, self.policy, config.discount, stamp=update)
         else:
             self.replay.extend(rollout.select(*REMEMBERED).reshape(rollout.shape[0], -1).transpose(0, 1))
-            self.critic.resolve(self._remembered(self.replay), self.policy, config.discount, stamp=update)
+            self.solve_anew(update)
         follow_basis(self.critic)
+
+    def solve_anew(self, update: int) -> TensorDictBase:
+        """Solve the differences of the replay under the policy as it is now; returns it [learners, 1, steps]."""
+        assert self.replay is not None
+        remembered = self._remembered(self.replay)
+        self.critic.resolve(remembered, self.policy, self.config.discount, stamp=update)
+        return remembered.unsqueeze(1)
 
     def _renew(self, rollout: TensorDictBase, update: int) -> None:
         """Forget, and set scaling and hyper-parameters by this rollout."""

@@ -11,6 +11,7 @@ arm, summary.json with the means over learners, and a picture.
 
 import dataclasses
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -25,12 +26,18 @@ import envs
 from torch_gprl.learners import PolicyGradient, PolicyGradientConfig
 from torch_gprl.runs import MetricsWriter, bootstrap_interval, read_metrics, save_figure
 
+Metrics = dict[str, Float[np.ndarray, "updates L"]]
+
 CLAIM_1: dict[str, dict[str, Any]] = {
     "REINFORCE": {"estimator": "return", "targets": "returns"},
     "return − batch mean": {"estimator": "mean-baseline", "targets": "returns"},
     "(.7) as printed, k = 10": {"estimator": "k-step", "horizon": 10, "targets": "returns"},
     "return − V_GP": {"estimator": "value-baseline", "targets": "returns"},
     "k = 10 with baseline": {"estimator": "k-step-baseline", "horizon": 10, "targets": "returns"},
+    "return − neural V": {"estimator": "value-baseline", "critic": "neural"},
+    "neural, generalised": {"estimator": "generalised", "trace": 0.8, "critic": "neural"},
+    "episodic natural": {"estimator": "return", "optimiser": "episodic-natural"},
+    "GP, generalised": {"estimator": "generalised", "trace": 0.8, "targets": "returns"},
     "GPTD, generalised": {"estimator": "generalised", "trace": 0.8, "targets": "differences"},
     "GPTD, all-action": {"estimator": "all-action", "targets": "differences"},
 }
@@ -38,11 +45,12 @@ PERSISTENT = {"renew_every": 10**6, "targets": "differences", "budget": 100}
 CLAIM_2: dict[str, dict[str, Any]] = {
     "estimated anew": PERSISTENT | {"renew_every": 1},
     **{f"kept, λ = {weight}": PERSISTENT | {"age_weight": weight} for weight in (0.0, 0.25, 0.5, 0.75, 1.0)},
+    "kept, solved anew": PERSISTENT | {"replay": 5_000},
 }
 PANELS = {
     "return": "return per episode",
     "gradient_cosine": "cosine of gradients from two halves",
-    "value_error": "RMSE of Q against roll-outs",
+    "value_error": "RMSE of Q against roll-outs, right after a policy update",
     "outdated": "share of basis vectors out of date",
 }
 SMOOTHED = 5  # updates
@@ -58,20 +66,31 @@ class Options:
     num_envs: int = 5  # environments of each learner
     frames: int = 60_000  # environment steps per learner
     seed: int = 0  # of all arms
+    most_arms: int = 99  # to run now; those that have run are read, and a later call goes on
     out: Path = Path("runs/policy-gradients")  # where results go
 
 
 def main(options: Options) -> None:
-    """Run every arm of a claim, leave metrics, summary and picture."""
+    """Run every arm of a claim that has not run yet, leave metrics, summary and picture."""
     torch.set_num_threads(1)
     folder = options.out / f"claim-{options.claim}-{options.task}"
     curves = {}
+    left = options.most_arms
     for name, numbers in (CLAIM_1 if options.claim == 1 else CLAIM_2).items():
-        curves[name] = run(options, numbers, folder / name.replace(" ", "-"))
+        place = folder / name.replace(" ", "-")
+        metrics = recorded(place, options.frames)
+        if metrics is None and not left:
+            continue
+        left -= metrics is None
+        curves[name] = run(options, numbers, place) if metrics is None else metrics
         value, low, high = summary(curves[name]["return"])
         print(f"{name:26s} return of the last tenth {value:8.1f} [{low:.1f}, {high:.1f}]", flush=True)
     figures = {
-        name: {key: dict(zip(("mean", "low", "high"), summary(arm[key]), strict=True)) for key in PANELS}
+        name: {
+            key: dict(zip(("mean", "low", "high"), summary(arm[key]), strict=True))
+            for key in PANELS
+            if key in arm
+        }
         for name, arm in curves.items()
     }
     (folder / "summary.json").write_text(json.dumps(figures, indent=2, ensure_ascii=False) + "\n")
@@ -79,7 +98,17 @@ def main(options: Options) -> None:
     print(f"everything is in {folder}")
 
 
-def run(options: Options, numbers: dict[str, Any], folder: Path) -> dict[str, Float[np.ndarray, "updates L"]]:
+def recorded(folder: Path, frames: int) -> Metrics | None:
+    """The metrics of an earlier run of an arm, if it went as far."""
+    if (folder / "metrics.csv").exists():
+        metrics = read_metrics(folder / "metrics.csv")
+        if metrics["frames"].max() >= frames:
+            return metrics
+        shutil.rmtree(folder)
+    return None
+
+
+def run(options: Options, numbers: dict[str, Any], folder: Path) -> Metrics:
     """One arm: its metrics by name."""
     env = envs.make(
         options.task, learners=options.learners, num_envs=options.num_envs, seed=options.seed, threads=1
@@ -101,12 +130,14 @@ def summary(metric: Float[np.ndarray, "updates L"]) -> tuple[float, float, float
     return float(last.mean()), float(low), float(high)
 
 
-def draw(curves: dict[str, dict[str, Float[np.ndarray, "updates L"]]], title: str) -> Figure:
+def draw(curves: dict[str, Metrics], title: str) -> Figure:
     """One panel for each metric, one line with its interval for each arm."""
     figure = Figure(figsize=(11, 7.5), layout="constrained")
     figure.suptitle(title)
     for axes, (key, label) in zip(figure.subplots(2, 2).flat, PANELS.items(), strict=True):
         for name, arm in curves.items():
+            if key not in arm:
+                continue
             smooth = _moving_mean(arm[key])
             frames = arm["frames"][len(arm["frames"]) - len(smooth) :, 0]
             low, high = bootstrap_interval(smooth)

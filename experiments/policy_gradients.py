@@ -28,24 +28,27 @@ from torch_gprl.runs import MetricsWriter, bootstrap_interval, read_metrics, sav
 
 Metrics = dict[str, Float[np.ndarray, "updates L"]]
 
+# The arms that matter most come first.
 CLAIM_1: dict[str, dict[str, Any]] = {
     "REINFORCE": {"estimator": "return", "targets": "returns"},
     "return − batch mean": {"estimator": "mean-baseline", "targets": "returns"},
-    "(.7) as printed, k = 10": {"estimator": "k-step", "horizon": 10, "targets": "returns"},
     "return − V_GP": {"estimator": "value-baseline", "targets": "returns"},
-    "k = 10 with baseline": {"estimator": "k-step-baseline", "horizon": 10, "targets": "returns"},
-    "return − neural V": {"estimator": "value-baseline", "critic": "neural"},
     "neural, generalised": {"estimator": "generalised", "trace": 0.8, "critic": "neural"},
-    "episodic natural": {"estimator": "return", "optimiser": "episodic-natural"},
-    "GP, generalised": {"estimator": "generalised", "trace": 0.8, "targets": "returns"},
     "GPTD, generalised": {"estimator": "generalised", "trace": 0.8, "targets": "differences"},
     "GPTD, all-action": {"estimator": "all-action", "targets": "differences"},
+    "GPTD, all-action, replay": {"estimator": "all-action", "targets": "differences", "replay": 3_000},
+    "episodic natural": {"estimator": "return", "optimiser": "episodic-natural"},
+    "(.7) as printed, k = 10": {"estimator": "k-step", "horizon": 10, "targets": "returns"},
+    "k = 10 with baseline": {"estimator": "k-step-baseline", "horizon": 10, "targets": "returns"},
+    "return − neural V": {"estimator": "value-baseline", "critic": "neural"},
+    "GP, generalised": {"estimator": "generalised", "trace": 0.8, "targets": "returns"},
 }
 PERSISTENT = {"renew_every": 10**6, "targets": "differences", "budget": 100}
 CLAIM_2: dict[str, dict[str, Any]] = {
     "estimated anew": PERSISTENT | {"renew_every": 1},
-    **{f"kept, λ = {weight}": PERSISTENT | {"age_weight": weight} for weight in (0.0, 0.25, 0.5, 0.75, 1.0)},
+    **{f"kept, λ = {weight}": PERSISTENT | {"age_weight": weight} for weight in (0.0, 0.5, 1.0)},
     "kept, solved anew": PERSISTENT | {"replay": 5_000},
+    **{f"kept, λ = {weight}": PERSISTENT | {"age_weight": weight} for weight in (0.25, 0.75)},
 }
 PANELS = {
     "return": "return per episode",

@@ -97,7 +97,7 @@ class Teacher:
         follow_basis(self.critic)
 
     def solve_anew(self, update: int) -> TensorDictBase:
-        """Solve the differences of the replay under the policy as it is now; returns it [learners, 1, steps]."""
+        """Solve the differences of the replay under today's policy; returns it [learners, 1, steps]."""
         assert self.replay is not None
         remembered = self._remembered(self.replay)
         self.critic.resolve(remembered, self.policy, self.config.discount, stamp=update)

@@ -4,11 +4,7 @@
         learner.collection = workers
         for figures in learner.train(): ...
 
-TorchRL's weight sync carries a policy's own tensors. Here the critic travels too, since exploration may ask
-it for its variance, and it arrives through `load_state_dict`, by which a Gaussian process learns that it has
-changed. Both stand in memory that all processes map, between two counters: the learner raises the first,
-writes, then raises the second; a worker that finds them different has read half of a change, and keeps what
-it has.
+How policy and critic reach them is told in `board`.
 """
 
 import copy
@@ -21,13 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import nn
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import EnvBase
 from torchrl.weight_update import NoWeightSyncScheme
 
+from torch_gprl.learners.board import Board, FollowingPolicy
 from torch_gprl.learners.collecting import watched
 from torch_gprl.policies.streams import NoiseStream
 
@@ -39,7 +36,6 @@ class WorkerCollection:
     Asynchronous ones make whole rollouts in turn while the learner learns: a rollout may have been begun
     under an older policy. Workers take up a new policy between two steps.
 
-    What travels are parameters and buffers; what a policy keeps elsewhere stays as it was at the start.
     Environments of workers are not saved, a resumed run begins new episodes. Every worker has random numbers
     of its own, drawn from the policy's streams: a run repeats itself if it is synchronous and keeps its
     number of workers. Scripts that use workers need the guard `if __name__ == "__main__"`.
@@ -135,68 +131,6 @@ class WorkerCollection:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Begin new episodes, whatever collection the state came from."""
-
-
-class Board:
-    """Tensors of modules where other processes can read them, in files that all of them map into memory.
-
-    Args:
-        folder: of the files; made by the first `post`.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._posted: TensorDict | None = None
-
-    def post(self, modules: nn.Module) -> None:
-        """Write all tensors of `modules`, between the two counters."""
-        state = modules.state_dict()
-        if self._posted is None:
-            counters = {"head": torch.zeros((), dtype=torch.long), "tail": torch.zeros((), dtype=torch.long)}
-            content = TensorDict({**counters, "state": TensorDict({k: v.cpu() for k, v in state.items()})})
-            self._posted = content.memmap(str(self.folder))
-        posted = self._posted
-        posted["head"].add_(1)
-        for name, tensor in state.items():
-            posted["state", name].copy_(tensor)
-        posted["tail"].copy_(posted["head"])
-
-    def read(self, seen: int) -> tuple[int, dict[str, Tensor]] | None:
-        """Version and tensors, if there is a whole version other than `seen`."""
-        if self._posted is None:
-            self._posted = TensorDict.load_memmap(self.folder)
-        version = int(self._posted["tail"])
-        if version == seen:
-            return None
-        state = self._posted.get("state").clone().to_dict()
-        return (version, state) if int(self._posted["head"]) == version else None
-
-
-class FollowingPolicy(TensorDictModuleBase):
-    """A worker's copy of the policy, which takes up what the learner has posted before it acts.
-
-    Args:
-        modules: copies of "policy" and, if it is followed, of "critic".
-        folder: of the board.
-    """
-
-    def __init__(self, modules: nn.ModuleDict, folder: Path) -> None:
-        super().__init__()
-        policy = modules["policy"]
-        assert isinstance(policy, TensorDictModuleBase)
-        self.in_keys = list(policy.in_keys)  # pyright: ignore[reportAttributeAccessIssue]
-        self.out_keys = list(policy.out_keys)  # pyright: ignore[reportAttributeAccessIssue]
-        self.modules_followed, self.policy = modules, policy
-        self.board, self.version = Board(folder), 0
-
-    @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Act as the learner's policy would."""
-        news = self.board.read(self.version)
-        if news is not None:
-            self.version, state = news
-            self.modules_followed.load_state_dict(state)
-        return self.policy(tensordict)
 
 
 class ReportingCollector(Collector):

@@ -1,0 +1,156 @@
+"""Claims 3 and 4: does exploration that asks the critic find rewards sooner than tuned noise?
+
+    python -m benchmarks.exploration [--quick] [--tasks pendulum-explore] [--arms thompson] [--learners 20]
+
+Every arm has the same learner, environments and starts, learner by learner, so that arms are compared in
+pairs. The tuned noise is the best of four standard deviations on the very same seeds, which favours it. Each
+finished arm is kept in --out; a second call runs what is missing. Leaves exploration.json and pictures there.
+"""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from scipy.stats import wilcoxon
+
+from benchmarks.exploration_arms import ARMS, GAUSSIAN, MATCHED, SETTINGS, Outcome, Setting, run
+from benchmarks.exploration_pictures import Snapshots, draw
+
+SHOWN = ("steps to threshold", "steps to discovery", "final return", "time in goal", "entropy of cells")
+QUICK_LEARNERS, QUICK_SHARE = 4, 5  # learners, and the part of the steps that a quick run takes
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to compare."""
+
+    tasks: tuple[str, ...] = tuple(SETTINGS)
+    arms: tuple[str, ...] = (*ARMS, MATCHED)
+    learners: int = 20  # paired seeds
+    quick: bool = False  # a fifth of the steps, four learners: shows that it works, not who wins
+    out: Path = field(default_factory=lambda: Path("runs/exploration"))  # where results go
+
+
+def main(options: Options) -> None:
+    """Run what is missing, print the table, leave JSON and pictures."""
+    torch.set_num_threads(1)
+    unknown = {*options.tasks} - {*SETTINGS} | {*options.arms} - {*ARMS, MATCHED}
+    if unknown:
+        known = ", ".join((*SETTINGS, *ARMS, MATCHED))
+        raise SystemExit(f"unknown task or arm: {', '.join(unknown)}; choose from {known}")
+    if options.quick:
+        options = dataclasses.replace(options, learners=QUICK_LEARNERS, out=options.out / "quick")
+    options.out.mkdir(parents=True, exist_ok=True)
+    for task in options.tasks:
+        setting = SETTINGS[task]
+        with Progress() as progress:
+            for arm in options.arms:
+                complete(setting, arm, options, progress)
+        report(setting, options.out)
+
+
+def record_of(setting: Setting, arm: str, out: Path) -> Path:
+    """Where a finished arm is kept."""
+    return out / f"{setting.task} {arm}.pt"
+
+
+def complete(setting: Setting, arm: str, options: Options, progress: Progress) -> None:
+    """Run an arm unless it is done; the matched one waits for the confidence that it is matched with."""
+    path = record_of(setting, arm, options.out)
+    frames = setting.frames // (QUICK_SHARE if options.quick else 1)
+    if path.exists() and torch.load(path, weights_only=True)["learners"] == options.learners:
+        return
+    numbers = ARMS.get(arm)
+    if numbers is None:
+        confidence = record_of(setting, "confidence", options.out)
+        if not confidence.exists():
+            return
+        measured = load(confidence)[0].measures(setting)["mean sigma"]
+        numbers = {"std": measured.square().mean().sqrt().item()}
+    bar = progress.add_task(f"{setting.task}, {arm}", total=frames)
+    pictures = Snapshots(setting)
+    for learner, outcome in run(setting, numbers, range(options.learners), frames):
+        progress.update(bar, completed=learner.frames)
+        pictures.take(learner)
+        last = outcome
+    fields = {name: getattr(last, name) for name in Outcome.__dataclass_fields__}
+    kept = {"learners": options.learners, "numbers": numbers, "pictures": pictures.taken, **fields}
+    torch.save(kept, path.with_suffix(".part"))
+    path.with_suffix(".part").replace(path)
+
+
+def load(path: Path) -> tuple[Outcome, dict[str, Any]]:
+    """What an arm did, and what was pictured of it."""
+    kept = torch.load(path, weights_only=True)
+    return Outcome(**{name: kept[name] for name in Outcome.__dataclass_fields__}), kept["pictures"]
+
+
+def report(setting: Setting, out: Path) -> None:
+    """Table, JSON and pictures of all arms of a task that are done."""
+    done = {arm: record_of(setting, arm, out) for arm in (*ARMS, MATCHED)}
+    loaded = {arm: load(path) for arm, path in done.items() if path.exists()}
+    measures = {arm: outcome.measures(setting) for arm, (outcome, _) in loaded.items()}
+    tried = [arm for arm in GAUSSIAN if arm in measures]
+    # the best σ: the earliest on average, then the best at the end
+    tuned = min(tried, key=lambda arm: _rank(measures[arm]), default=None)
+    found = {arm: summarise(one, measures.get(tuned or "")) for arm, one in measures.items()}
+    _show(setting, found, tuned)
+    path = out / "exploration.json"
+    everything = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    everything[setting.task] = {"tuned": tuned, "arms": found}
+    path.write_text(json.dumps(everything, indent=2) + "\n", encoding="utf-8")
+    draw(
+        setting,
+        {arm: outcome for arm, (outcome, _) in loaded.items()},
+        {arm: pictures for arm, (_, pictures) in loaded.items()},
+        out,
+    )
+
+
+def _rank(measured: dict[str, torch.Tensor]) -> tuple[float, float]:
+    return measured["steps to threshold"].mean().item(), -measured["final return"].mean().item()
+
+
+def summarise(
+    measured: dict[str, torch.Tensor], baseline: dict[str, torch.Tensor] | None
+) -> dict[str, dict[str, float | Sequence[float]]]:
+    """Mean, median and values of each measure, with a paired test against the baseline."""
+    return {
+        name: {
+            "mean": values.mean().item(),
+            "median": values.median().item(),
+            "p": _paired(values, baseline[name]) if baseline else 1.0,
+            "values": values.tolist(),
+        }
+        for name, values in measured.items()
+    }
+
+
+def _paired(values: torch.Tensor, baseline: torch.Tensor) -> float:
+    """Wilcoxon's signed-rank test of paired seeds, two-sided; 1 if nothing differs."""
+    if len(values) != len(baseline) or torch.equal(values, baseline):
+        return 1.0
+    return float(wilcoxon((values - baseline).numpy()).pvalue)
+
+
+def _show(setting: Setting, found: dict[str, dict[str, Any]], tuned: str | None) -> None:
+    table = Table(title=f"{setting.task}: means (p against {tuned}, paired)")
+    table.add_column("arm")
+    for name in SHOWN:
+        table.add_column(name)
+    for arm, measured in found.items():
+        cells = (f"{measured[name]['mean']:.3g} ({measured[name]['p']:.2g})" for name in SHOWN)
+        table.add_row(arm, *cells)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -18,8 +18,7 @@ import contextlib
 import math
 import sys
 import time
-import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,13 +48,16 @@ from torch_gprl.runs import (
     RunFolder,
     StopRequest,
     UserError,
+    check_device,
     check_logger,
     compare_curves,
     evaluate,
+    failures_of,
     film,
     foresee,
     foresight_figure,
     learning_curve,
+    mistakes_of_the_user,
     read_metrics,
     save_figure,
     summary,
@@ -64,8 +66,17 @@ from torch_gprl.runs import (
     write_report,
     write_video,
 )
+from torch_gprl.runs.command_options import (
+    EVALUATION_SEED,
+    ARun,
+    EvaluateOptions,
+    PlotOptions,
+    RenderOptions,
+    ReportOptions,
+    ResumeOptions,
+    TasksOptions,
+)
 
-EVALUATION_SEED = 1_000_000  # the starts of all evaluations, whatever the run's own seed
 LONGEST_FILM = 300  # frames
 JUDGED_EPISODES = 5  # over which a critic's foresight is shown
 PICTURES = Path(__file__).parent / "docs" / "tasks.jpg"
@@ -138,57 +149,6 @@ ALGORITHMS = {
 }
 
 
-@dataclass(frozen=True)
-class ResumeOptions:
-    """Go on where a run was stopped or killed, as if it had not been."""
-
-    folder: tyro.conf.Positional[Path]  # the run's folder
-    checkpoint: int | None = None  # update to go on from; the latest unless given
-
-
-@dataclass(frozen=True)
-class EvaluateOptions:
-    """Returns of a run's policies without exploration."""
-
-    folder: tyro.conf.Positional[Path]  # the run's folder
-    checkpoint: int | None = None  # update whose policies are judged; the latest unless given
-    episodes: int = 100  # for each learner
-    seed: int = EVALUATION_SEED  # of the episodes' starts
-
-
-@dataclass(frozen=True)
-class RenderOptions:
-    """Film one learner's policy, without exploration, through an episode."""
-
-    folder: tyro.conf.Positional[Path]  # the run's folder
-    checkpoint: int | None = None  # update whose policy is shown; the latest unless given
-    learner: int | None = None  # whom to show; the best in 20 episodes unless given
-    seed: int = EVALUATION_SEED  # of the episode's start
-    out: Path | None = None  # the film, ending in .mp4; unless given in the run's folder
-
-
-@dataclass(frozen=True)
-class PlotOptions:
-    """Learning curves of runs in one picture, each with the band of its learners."""
-
-    folders: tyro.conf.Positional[tuple[Path, ...]]  # the runs' folders
-    metric: str = "return"  # column of metrics.csv
-    out: Path = Path("comparison.png")  # the picture: .png, .pdf or .svg
-
-
-@dataclass(frozen=True)
-class ReportOptions:
-    """Evaluate and draw a run again, and write its report.html."""
-
-    folder: tyro.conf.Positional[Path]  # the run's folder
-    checkpoint: int | None = None  # update that is shown; the latest unless given
-
-
-@dataclass(frozen=True)
-class TasksOptions:
-    """List the tasks."""
-
-
 def main(arguments: list[str]) -> int:
     """Run the command line; return the exit code: 0, 1 for a failed run, 2 for an error of the user, 130."""
     torchrl_logger.setLevel("WARNING")  # it tells of buffers on standard output
@@ -197,7 +157,8 @@ def main(arguments: list[str]) -> int:
         if name in ALGORITHMS:
             start(name, options)
         else:
-            COMMANDS[name](options)
+            _, command = COMMANDS[name]
+            command(options)
     except (UserError, RunFailure) as error:
         print(f"train.py: {error}", file=sys.stderr)
         return 2 if isinstance(error, UserError) else 1
@@ -209,7 +170,7 @@ def main(arguments: list[str]) -> int:
 
 def parse(arguments: list[str]) -> tuple[str, Any]:
     """The name of an algorithm or a command, and its options."""
-    return CommandLine(__doc__ or "", ALGORITHMS, OPTIONS).parse(arguments)
+    return COMMAND_LINE.parse(arguments)
 
 
 def start(name: str, options: Options) -> None:
@@ -227,14 +188,14 @@ def start(name: str, options: Options) -> None:
 
 def resume(options: ResumeOptions) -> None:
     """Take up a run from its checkpoint, or from its start if it has none yet."""
-    run = opened(options.folder, options.checkpoint)
+    run = opened(options)
     check_logger(run.options.logger)
     print(f"going on after update {run.learner.updates} in {run.folder.path}", flush=True)
     learn(run.learner, run.options, run.folder, resumed=True)
     conclude(run.learner, run.options, run.folder)
 
 
-class Run(NamedTuple):
+class Opened(NamedTuple):
     """A run that was started earlier, as it stands at a checkpoint."""
 
     folder: RunFolder
@@ -242,32 +203,32 @@ class Run(NamedTuple):
     learner: Learner
 
 
-def opened(path: Path, checkpoint: int | None) -> Run:
+def opened(run: ARun) -> Opened:
     """The run of a folder, at an update or as late as there is a checkpoint."""
-    folder = RunFolder.opened(path)
-    name, settings = CommandLine("", ALGORITHMS, OPTIONS).settings_of(folder.config)
+    folder = RunFolder.opened(run.folder)
+    name, settings = COMMAND_LINE.settings_of(folder.config)
     options = parse([name, *settings])[1]
     learner = build(name, options)
     checkpoints = Checkpoints(folder.checkpoints, learner=learner)
-    file = checkpoints.latest() if checkpoint is None else checkpoints.at(checkpoint)
+    file = checkpoints.latest() if run.checkpoint is None else checkpoints.at(run.checkpoint)
     if file is not None:
         checkpoints.load(file)
-    return Run(folder, options.run, learner)
+    return Opened(folder, options.run, learner)
 
 
 def build(name: str, options: Options) -> Learner:
     """The learner with its environment, at the start of a run."""
-    _check_device(options.run.device)
+    check_device(options.run.device)
     torch.set_num_threads(options.run.threads)
     torch.manual_seed(options.run.seed)
     env = make_env(options.run, options.run.num_envs, options.run.seed)
-    with _construction_errors():
+    with mistakes_of_the_user():
         return ALGORITHMS[name].learner(env, options.algorithm, seed=options.run.seed)
 
 
 def make_env(options: RunOptions, num_envs: int, seed: int) -> Any:  # noqa: ANN401  (TorchRL's EnvBase and more)
     """The task's environment of batch `[learners, num_envs]`."""
-    with _construction_errors():
+    with mistakes_of_the_user():
         return envs.make(
             options.task,
             learners=options.learners,
@@ -276,23 +237,6 @@ def make_env(options: RunOptions, num_envs: int, seed: int) -> Any:  # noqa: ANN
             device=options.device,
             threads=options.threads,
         )
-
-
-def _check_device(name: str) -> None:
-    try:
-        torch.zeros(1, device=name)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"device '{name}' cannot be used: {reason}; --device cpu always can") from error
-
-
-@contextlib.contextmanager
-def _construction_errors() -> Iterator[None]:
-    """Options that only the task or the algorithm can judge are the user's to mend, too."""
-    try:
-        yield
-    except (ValueError, KeyError) as error:
-        raise UserError(" ".join(str(error.args[0] if error.args else error).split())) from error
 
 
 def learn(learner: Learner, options: RunOptions, folder: RunFolder, resumed: bool = False) -> None:
@@ -304,7 +248,7 @@ def learn(learner: Learner, options: RunOptions, folder: RunFolder, resumed: boo
     saved = -math.inf  # s; the first update is saved, so that a failure leaves something to go on from
     with (
         contextlib.closing(metrics),
-        _failures(learner, folder),
+        failures_of(learner, folder),
         StopRequest() as stop,
         Progress(learner.config.total_frames, title, before=learner.frames) as progress,
     ):
@@ -320,21 +264,6 @@ def learn(learner: Learner, options: RunOptions, folder: RunFolder, resumed: boo
         checkpoints.save(learner.updates)
     if stop.asked:
         print(f"stopped after {learner.frames} environment steps per learner", flush=True)
-
-
-@contextlib.contextmanager
-def _failures(learner: Learner, folder: RunFolder) -> Iterator[None]:
-    """Whatever breaks while learning ends the run with its cause and the way to go on."""
-    try:
-        yield
-    except Exception as error:
-        with contextlib.suppress(OSError):  # the disk may be what failed
-            folder.failure.write_text(traceback.format_exc(), encoding="utf-8")
-        cause = " ".join(f"{type(error).__name__}: {error}".split())
-        raise RunFailure(
-            f"failed after update {learner.updates} by {cause} (the trace is in {folder.failure}); "
-            f"--resume {folder.path} goes on from the last checkpoint"
-        ) from error
 
 
 def conclude(learner: Learner, options: RunOptions, folder: RunFolder) -> None:
@@ -368,7 +297,7 @@ def draw(learner: Learner, options: RunOptions, folder: RunFolder, best: int) ->
 
 def evaluate_run(options: EvaluateOptions) -> None:
     """Print the returns of every learner, and the summary."""
-    run = opened(options.folder, options.checkpoint)
+    run = opened(options)
     returns = evaluate(make_env(run.options, options.episodes, options.seed), run.learner.policy)
     for learner, value in enumerate(returns.mean(dim=1).tolist()):
         print(f"learner {learner}: mean return {value:.2f}")
@@ -377,7 +306,7 @@ def evaluate_run(options: EvaluateOptions) -> None:
 
 def render(options: RenderOptions) -> None:
     """Write a film of one learner."""
-    run = opened(options.folder, options.checkpoint)
+    run = opened(options)
     learner = options.learner
     if learner is None:
         returns = evaluate(make_env(run.options, 20, EVALUATION_SEED), run.learner.policy)
@@ -408,7 +337,7 @@ def plot(options: PlotOptions) -> None:
 
 def report(options: ReportOptions) -> None:
     """Evaluate and draw a run again."""
-    run = opened(options.folder, options.checkpoint)
+    run = opened(options)
     conclude(run.learner, run.options, run.folder)
 
 
@@ -420,22 +349,17 @@ def list_tasks(options: TasksOptions) -> None:
     print(f"pictures: {PICTURES}")
 
 
-OPTIONS = {
-    "resume": ResumeOptions,
-    "evaluate": EvaluateOptions,
-    "render": RenderOptions,
-    "plot": PlotOptions,
-    "report": ReportOptions,
-    "tasks": TasksOptions,
+COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {
+    "resume": (ResumeOptions, resume),
+    "evaluate": (EvaluateOptions, evaluate_run),
+    "render": (RenderOptions, render),
+    "plot": (PlotOptions, plot),
+    "report": (ReportOptions, report),
+    "tasks": (TasksOptions, list_tasks),
 }
-COMMANDS: dict[str, Callable[[Any], None]] = {
-    "resume": resume,
-    "evaluate": evaluate_run,
-    "render": render,
-    "plot": plot,
-    "report": report,
-    "tasks": list_tasks,
-}
+COMMAND_LINE = CommandLine(
+    __doc__ or "", ALGORITHMS, {name: options for name, (options, _) in COMMANDS.items()}
+)
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

@@ -6,8 +6,9 @@ Nothing here knows what is learned: these take tensors, arrays and labels.
 from torch_gprl.runs.checkpoints import Checkpoints
 from torch_gprl.runs.command_line import Algorithm, CommandLine
 from torch_gprl.runs.curves import LoggerName, check_logger
-from torch_gprl.runs.errors import RunFailure, UserError
+from torch_gprl.runs.errors import UserError, check_device, mistakes_of_the_user
 from torch_gprl.runs.evaluation import evaluate, film, summary
+from torch_gprl.runs.failures import RunFailure, failures_of
 from torch_gprl.runs.figures import Surface, compare_curves, learning_curve, save_figure, value_surface
 from torch_gprl.runs.folder import RunFolder
 from torch_gprl.runs.foresight import foresee, foresight_figure
@@ -32,13 +33,16 @@ __all__ = [
     "Surface",
     "UserError",
     "bootstrap_interval",
+    "check_device",
     "check_logger",
     "compare_curves",
     "evaluate",
+    "failures_of",
     "film",
     "foresee",
     "foresight_figure",
     "learning_curve",
+    "mistakes_of_the_user",
     "read_metrics",
     "save_figure",
     "summary",

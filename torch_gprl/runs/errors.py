@@ -1,4 +1,9 @@
-"""What ends a run early, shown as a single line without a traceback."""
+"""Mistakes that are the user's to mend, shown as a single line without a traceback."""
+
+import contextlib
+from collections.abc import Iterator
+
+import torch
 
 
 class UserError(Exception):
@@ -8,8 +13,23 @@ class UserError(Exception):
     """
 
 
-class RunFailure(Exception):
-    """Something broke while a run was learning.
+@contextlib.contextmanager
+def mistakes_of_the_user() -> Iterator[None]:
+    """Within it bad values become a `UserError`: some options only the task or the algorithm can judge."""
+    try:
+        yield
+    except (ValueError, KeyError) as error:
+        raise UserError(" ".join(str(error.args[0] if error.args else error).split())) from error
 
-    The message is one line: the cause, and how to go on from what was kept.
+
+def check_device(name: str) -> None:
+    """Refuse a device that is not there.
+
+    Raises:
+        UserError: with the reason.
     """
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"device '{name}' cannot be used: {reason}; --device cpu always can") from error

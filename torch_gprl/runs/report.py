@@ -53,6 +53,7 @@ dt { color: var(--faint); font-size: .85rem; } dd { margin: 0; font-size: 1.15re
 img, video { display: block; width: 100%; height: auto; border: 1px solid var(--line); border-radius: .5rem;
              background: #fff; }
 img.small, video { max-width: 36rem; }
+.wide { overflow-x: auto; } .wide img { min-width: 38rem; }
 table { border-collapse: collapse; width: 100%; font-size: .9rem; }
 td { border-top: 1px solid var(--line); padding: .2rem .8rem .2rem 0; vertical-align: top; }
 td:first-child { color: var(--faint); width: 13rem; } summary { cursor: pointer; font-weight: 600; }
@@ -145,11 +146,12 @@ def _metrics_figure(folder: RunFolder) -> Figure:
 def _picture(path: Path, name: str, about: str) -> str:
     if not path.exists():
         return ""
-    small = ' class="small"' if path.stem == "learning_curve" else ""
-    return (
-        f"<h2>{escape(name)}</h2><p>{escape(about)}</p>"
-        f'<img{small} alt="{escape(name)}" src="{_data(path, "image/png")}">'
-    )
+    small = path.stem == "learning_curve"
+    kind = ' class="small"' if small else ""
+    image = f'<img{kind} alt="{escape(name)}" src="{_data(path, "image/png")}">'
+    # Several panels side by side are scrolled on a narrow screen, or nobody could read them.
+    shown = image if small else f'<div class="wide">{image}</div>'
+    return f"<h2>{escape(name)}</h2><p>{escape(about)}</p>{shown}"
 
 
 def _film(path: Path) -> str:

@@ -25,9 +25,6 @@ YOUTH = 20  # observations for each vector of the budget
 GROUP = 8
 
 
-Count = TypeVar("Count", int, Tensor)
-
-
 class BoundedBasis(WhitenedState):
     """The state of a sparse process whose basis is bounded; arguments as `SparseOnlineGP`."""
 
@@ -61,11 +58,13 @@ class BoundedBasis(WhitenedState):
         prior = self.kernel.diag(inputs)
         novelty = prior - torch.linalg.vecdot(phi, phi, dim=-2)
         threshold = torch.maximum(self.novelty_threshold * noise, NOVELTY_FLOOR[prior.dtype] * prior)
+        candidate = novelty > threshold if mask is None else (novelty > threshold) & mask
+        if not bool(candidate.any()):
+            return phi, novelty
         # free growth up to the budget, then the churn, never past the buffers
-        churn = self._churn(self._count(inputs.shape[-2], mask))
+        churn = self._churn(inputs.shape[-2] if mask is None else mask.sum(-1))
         limit = torch.minimum((self.budget - self.size).clamp_min(0) + churn, self.capacity - self.size)
-        candidate = (novelty > threshold) & (limit > 0).unsqueeze(-1)
-        if not bool((candidate if mask is None else candidate & mask).any()):
+        if not bool(limit.any()):
             return phi, novelty
         residual = self.kernel(inputs, inputs) - phi.mT @ phi
         open_to = novelty if mask is None else novelty.where(mask, -torch.inf)
@@ -98,11 +97,7 @@ class BoundedBasis(WhitenedState):
         buffer = self.get_buffer(name)
         return buffer.view(-1, *buffer.shape[len(self.batch_shape) :])
 
-    def _count(self, points: int, mask: Tensor | None) -> Tensor:
-        """How many of a block's points count, for each learner."""
-        return torch.full_like(self.size, points) if mask is None else mask.sum(-1)
-
-    def _churn(self, points: Tensor) -> Tensor:
+    def _churn(self, points: int | Tensor) -> Tensor:
         """Most additions to a full basis from the next points, of each learner."""
         before, youth = self.observations, YOUTH * self.budget
         if self.order == "arrival":
@@ -111,15 +106,15 @@ class BoundedBasis(WhitenedState):
         early, late = before.clamp_max(youth), after.clamp_max(youth)
         return admissions(after, late, youth, group) - admissions(before, early, youth, group)
 
-    def _group(self, points: Count) -> Count:
+    def _group(self, points: int | Tensor) -> int | Tensor:
         """How many additions to a full basis come at once, from a block of so many points."""
         largest = max(1, min(GROUP, self.overshoot // 6))
         return 1 + (largest - 1) * (points >= 2 * GROUP)
 
-    def _is_full(self, rows: Count, points: Count) -> Count:
-        """Whether so many rows in use leave no room for the additions of another block of so many points."""
+    def _room(self, points: int | Tensor) -> int | Tensor:
+        """Rows kept free for the additions of a next block of so many points."""
         room = self._group(points) + -(-points // CHURN) - 1
-        return (rows > self.capacity - room) & (rows > self.budget)
+        return room.clamp_max(self.overshoot) if isinstance(room, Tensor) else min(room, self.overshoot)
 
     def _prune(self, full: Tensor) -> None:
         """Delete the lowest scores of the learners that are `full` until they are back at their budget."""
@@ -148,7 +143,10 @@ class BoundedBasis(WhitenedState):
         self._stale = True
 
 
-def admissions(observations: Count, young: Count, youth: int, group: Count) -> Count:
+Count = TypeVar("Count", int, Tensor)
+
+
+def admissions(observations: Count, young: Count, youth: int, group: Count | int) -> Count:
     """How many points, the first `young` in its youth, a basis that was always full has admitted at most."""
     early, late = young // YOUNG_CHURN, (observations - young) // CHURN
     return early - early % group * (young < youth) + late - late % group

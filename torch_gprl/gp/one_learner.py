@@ -14,6 +14,7 @@ from torch_gprl.gp.observed import Observed
 from torch_gprl.gp.whitened import NOVELTY_FLOOR, solve_triangular, squared_columns
 
 LOG_TWO_PI = math.log(2 * math.pi)
+LARGE = 128  # rows and points from which a matrix product in parts is faster
 
 
 def absorb(gp: BoundedBasis, block: Observed, noise_variance: float) -> None:
@@ -25,7 +26,7 @@ def absorb(gp: BoundedBasis, block: Observed, noise_variance: float) -> None:
     gp.observations.add_(points)
     if not gp._stale:
         gp._stale = True
-    if gp._is_full(rows, points):
+    if rows > gp.capacity - int(gp._room(points)):
         gp._prune(gp.size == rows)
 
 
@@ -39,9 +40,9 @@ def _absorb_block(gp: BoundedBasis, inputs: Tensor, targets: Tensor, noise_varia
     rows = len(phi)
     # moment: W = 1/(σ0² + ν); dtc ignores what the basis misses
     variance = novelty.add_(noise_variance) if gp.projection == "moment" else novelty.fill_(noise_variance)
-    noise = variance.sqrt()
-    phi, targets = phi / noise, targets / noise
-    _only(gp.precision, 2)[:rows, :rows].addmm_(phi, phi.mT)  # A += Φ W Φᵀ
+    scale = variance.rsqrt()
+    phi, targets = phi.mul_(scale), targets * scale
+    _add_gram(_only(gp.precision, 2)[:rows, :rows], phi)  # A += Φ W Φᵀ
     _only(gp.information, 1)[:rows].add_(phi.mv(targets))  # b += Φ W y
     log_density = variance.log_().sum() + targets.dot(targets)
     gp.evidence_constant.sub_(log_density + len(inputs) * LOG_TWO_PI, alpha=0.5)
@@ -77,7 +78,7 @@ def _most_additions(gp: BoundedBasis, rows: int, points: int) -> int:
     """Free growth up to the budget, then the churn, never past the buffers."""
     before, youth = int(gp.observations), YOUTH * gp.budget
     after = before + points
-    group, churn = gp._group(points), 1
+    group, churn = int(gp._group(points)), 1
     if gp.order == "novelty":
         churn = admissions(after, min(after, youth), youth, group)
         churn -= admissions(before, min(before, youth), youth, group)
@@ -115,6 +116,16 @@ def _append(gp: BoundedBasis, before: int, gram_rows: Tensor, points: Tensor) ->
     _only(gp.basis, 2)[before:after] = points
     _only(gp.stamps, 1)[before:after] = gp.clock
     gp.size.fill_(after)
+
+
+def _add_gram(matrix: Tensor, columns: Tensor) -> None:
+    """M += C Cᵀ; of a large product, which is symmetric, a quarter is copied."""
+    rows = len(columns)
+    top = rows // 2 if min(columns.shape) >= LARGE else rows
+    matrix[:top, :top].addmm_(columns[:top], columns[:top].mT)
+    if top < rows:
+        matrix[top:].addmm_(columns[top:], columns.mT)
+        matrix[:top, top:] = matrix[top:, :top].mT
 
 
 def _only(tensor: Tensor, dims: int) -> Tensor:

@@ -105,7 +105,7 @@ class ParallelSparseGP(SparseOnlineGP):
             phi, novelty = self._difference(phi, block.inputs, block.next_inputs, block.discount)
         variance = noise + novelty if self.projection == "moment" else noise.expand_as(novelty)
         self._accumulate(phi, variance, block.targets, block.mask)
-        full = self._is_full(self.size, points)
+        full = self.size > self.capacity - self._room(points)
         if bool(full.any()):
             self._prune(full)
 

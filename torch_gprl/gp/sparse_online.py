@@ -12,7 +12,6 @@ from functools import partial
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torch_gprl.gp import one_learner
 from torch_gprl.gp.bounded import BoundedBasis
@@ -114,7 +113,8 @@ class SparseOnlineGP(BoundedBasis):
         # moment: W = 1/(σ0² + ν); dtc ignores what the basis misses
         variance = noise + novelty if self.projection == "moment" else noise.expand_as(novelty)
         self._accumulate(phi, variance, block.targets, block.mask)
-        full = self._is_full(self.size, self._count(block.targets.shape[-1], block.mask))
+        points = block.targets.shape[-1] if block.mask is None else block.mask.sum(-1)
+        full = self.size > self.capacity - self._room(points)
         if bool(full.any()):
             self._prune(full)
 
@@ -143,9 +143,8 @@ class SparseOnlineGP(BoundedBasis):
     ) -> tuple[Tensor, Tensor]:
         """φ and novelty of f(x) − γ f(x'), from φ of x."""
         averaged = self._features(following)
-        # rows that no learner uses are zero, and may be more or fewer in φ
-        same_rows = pad(phi, (0, 0, 0, averaged.shape[-2] - phi.shape[-2]))
-        difference = same_rows - discount.unsqueeze(-2) * averaged
+        # the picks of small learners may have left rows of φ that no learner uses
+        difference = phi[..., : averaged.shape[-2], :] - discount.unsqueeze(-2) * averaged
         shared = self.kernel.expected_pairs(following, GaussianInputs.exactly(inputs))
         own = self._prior_variance(following)
         # Var[f(x) − γ f(x')] = k(x, x) − 2γ k(x, x') + γ² k(x', x')

@@ -60,8 +60,9 @@ class GaussianBumps:
         with torch.no_grad():
             self.inverse = log_lengthscale.neg().exp_().unsqueeze(-2)
             self.centre = z[..., :1, :].to(log_lengthscale.dtype)
-            self.points = (z - self.centre) * self.inverse
-            square = torch.linalg.vecdot(self.points, self.points).unsqueeze(-2)
+            points = (z - self.centre) * self.inverse
+            square = torch.linalg.vecdot(points, points).unsqueeze(-2)
+            self.columns = points.mT
             self.peak = torch.sub(log_outputscale[..., None, None], square, alpha=0.5)  # log σ² − ½|z|²/ℓ²
 
     def __call__(self, x: Inputs) -> Float[Tensor, "... M N"]:
@@ -69,10 +70,10 @@ class GaussianBumps:
         x = (x.to(self.peak.dtype) - self.centre) * self.inverse
         square = torch.linalg.vecdot(x, x).unsqueeze(-1)
         add_product = {2: torch.addmm, 3: torch.baddbmm}.get(x.ndim)
-        if add_product is not None and x.shape[:-2] == self.points.shape[:-2]:
-            exponent = add_product(self.peak, x, self.points.mT)
+        if add_product is not None and x.shape[:-2] == self.columns.shape[:-2]:
+            exponent = add_product(self.peak, x, self.columns)
         else:
-            exponent = self.peak + x @ self.points.mT
+            exponent = self.peak + x @ self.columns
         return exponent.sub_(square, alpha=0.5).exp_().mT
 
 

@@ -12,6 +12,7 @@ from functools import partial
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torch_gprl.gp import one_learner
 from torch_gprl.gp.bounded import BoundedBasis
@@ -143,8 +144,9 @@ class SparseOnlineGP(BoundedBasis):
     ) -> tuple[Tensor, Tensor]:
         """φ and novelty of f(x) − γ f(x'), from φ of x."""
         averaged = self._features(following)
-        # the picks of small learners may have left rows of φ that no learner uses
-        difference = phi[..., : averaged.shape[-2], :] - discount.unsqueeze(-2) * averaged
+        # rows that no learner uses are zero, and may be more or fewer in φ
+        same_rows = pad(phi, (0, 0, 0, averaged.shape[-2] - phi.shape[-2]))
+        difference = same_rows - discount.unsqueeze(-2) * averaged
         shared = self.kernel.expected_pairs(following, GaussianInputs.exactly(inputs))
         own = self._prior_variance(following)
         # Var[f(x) − γ f(x')] = k(x, x) − 2γ k(x, x') + γ² k(x', x')

@@ -209,6 +209,27 @@ def test_values_stay_within_what_rewards_can_add_up_to():
     assert process.gp.observations == len(teacher.replay) == 80
 
 
+@pytest.mark.parametrize("hindsight", [True, False])
+def test_with_hindsight_no_target_is_below_what_the_episode_attained(hindsight):
+    generator = torch.Generator().manual_seed(0)
+    teacher, process = fitted(hindsight=hindsight, optimism=-1.0)
+    with torch.no_grad():
+        process.gp.log_noise_variance.fill_(0.0)  # a critic that believes little of what it is told
+    teacher.learn(walk(torch.rand(12, generator=generator).double().tolist()))
+    data = teacher._remembered()
+    first = teacher._first_targets(data)
+    target = teacher._iterate(data, first, process.inputs(data.observation, data.action))[0]
+    attained = data.reward[0, :-1] + DISCOUNT * target[1:]
+    assert (target[:-1] >= attained - 0.01).all() == hindsight
+
+
+def test_transitions_of_different_environments_and_episodes_are_not_joined():
+    one, other = walk([1.0, 2.0]), walk([3.0, 4.0], done=[True, False])
+    teacher, _ = fitted()
+    teacher.learn(torch.cat([one, other], 1))
+    assert teacher._remembered().continues.tolist() == [[True, False, False, False]]
+
+
 def test_optimism_values_the_unknown_above_what_was_seen():
     plain, hopeful = (fitted(optimism=optimism) for optimism in (0.0, 2.0))
     far = torch.full((1, 1, 1), 1e3, dtype=torch.float64)

@@ -26,6 +26,7 @@ class QLearningConfig(Behaviour):
     targets: Targets = "fitted"  # solve all experience anew, or the thesis' update of each rollout, once
     sweeps: int = 30  # most sweeps of value iteration in a solution; fitted
     growth: float = 0.1  # share by which experience grows between solutions; fitted
+    hindsight: bool = True  # targets are at least what the episode attained; for little noise; fitted
     learning_rate: float = 1.0  # step from the old value to the target, from 0 to 1; online
     horizon: int = 1  # real rewards before the maximum over actions, m of (.8); online
 

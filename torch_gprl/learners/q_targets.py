@@ -6,8 +6,11 @@ Online (the thesis' (.8)), each rollout once, with the critic as it stands:
 
 A target absorbed under an early critic is never forgotten. Fitted Q iteration (Ernst, Geurts and Wehenkel,
 2005) repeats y = r + γ max_a Q(s', a) and the regression on y over all transitions until the values settle.
-On a fixed basis the weights α are linear in y, so a sweep costs two products of matrices; targets are clipped
-to what rewards seen so far can add up to.
+On a fixed basis the weights α are linear in y, so a sweep costs two products of matrices. Targets are clipped
+to what rewards seen so far can add up to, and are at least what the same episode went on to attain (He, Liu,
+Schwing and Peng, 2017), which carries a reward back along a whole episode in one sweep's time per step:
+
+    y_t = r_t + γ max(max_a Q(s_{t+1}, a), y_{t+1})
 """
 
 import math
@@ -31,6 +34,7 @@ REMEMBERED = (
     ("next", "observation"),
     ("next", "reward"),
     ("next", "terminated"),
+    ("next", "done"),
 )
 SETTLED = 1e-3  # mean change of the targets in a sweep, in their deviations, that ends a solution
 RENEWAL = 1.5  # growth of experience between renewals of scaling and basis
@@ -89,6 +93,7 @@ class Transitions(NamedTuple):
     reward: Float[Tensor, "learners N"]
     next_observation: Float[Tensor, "learners N S"]
     terminated: Bool[Tensor, "learners N"]
+    continues: Bool[Tensor, "learners N"]  # whether the next one took off where this one ended
 
     def range(self, discount: float) -> tuple[Float[Tensor, "learners 1"], Float[Tensor, "learners 1"]]:
         """The least and the largest discounted sum of rewards like those seen, ended by a terminal or not."""
@@ -170,13 +175,16 @@ class FittedQ:
         stored = self.replay[:]
         assert isinstance(stored, TensorDictBase)
         stored, like = stored.transpose(0, 1), self.critic.input_loc
-        following = stored.get("next")
+        following, observation = stored.get("next"), stored.get("observation")
+        done = following.get("done").squeeze(-1)
+        joined = (following.get("observation")[:, :-1] == observation[:, 1:]).all(-1) & ~done[:, :-1]
         return Transitions(
-            stored.get("observation").to(like),
+            observation.to(like),
             stored.get("action").to(like),
             following.get("reward").squeeze(-1).to(like),
             following.get("observation").to(like),
             following.get("terminated").squeeze(-1).to(like.device),
+            torch.cat([joined, torch.zeros_like(done[:, :1])], 1).to(like.device),
         )
 
     def _first_targets(self, data: Transitions) -> Tensor:
@@ -224,7 +232,11 @@ class FittedQ:
         moving = torch.ones_like(loc, dtype=torch.bool)
         for _ in range(self.config.sweeps):
             best = products.mean(regression.alpha((target - loc) / scale)).amax(-1)
-            renewed = self._target(data, loc + scale * best)
+            value = loc + scale * best
+            if self.config.hindsight:
+                attained = torch.where(data.continues, target.roll(-1, 1), -torch.inf)
+                value = torch.maximum(value, attained)
+            renewed = self._target(data, value)
             change = (renewed - target).abs().mean(-1, keepdim=True) / scale
             target = torch.where(moving, renewed, target)
             moving = moving & (change > SETTLED)

@@ -15,13 +15,14 @@ Ctrl-C ends a run early and keeps what was learned; a second Ctrl-C aborts at on
 """
 
 import contextlib
+import functools
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 import tyro
@@ -36,6 +37,8 @@ from torch_gprl.learners import (
     PolicyGradientConfig,
     QLearning,
     QLearningConfig,
+    RayCollection,
+    WorkerCollection,
 )
 from torch_gprl.runs import (
     Algorithm,
@@ -77,6 +80,8 @@ from torch_gprl.runs.command_options import (
     TasksOptions,
 )
 
+CollectorName = Literal["single", "multi-sync", "multi-async", "ray"]
+WORKER_SEEDS = 1_000_003  # apart: workers' environments repeat neither each other's nor other runs' numbers
 LONGEST_FILM = 300  # frames
 JUDGED_EPISODES = 5  # over which a critic's foresight is shown
 PICTURES = Path(__file__).parent / "docs" / "tasks.jpg"
@@ -96,16 +101,23 @@ class RunOptions:
     evaluation_episodes: int = 20  # episodes of the final evaluation, for each learner
     checkpoint_interval: float = 60.0  # s between checkpoints; changes no result
     logger: LoggerName = "tensorboard"  # of the curves, beside metrics.csv; csv writes that table alone
+    collector: CollectorName = "single"  # who steps the environments; workers' are not saved with checkpoints
+    workers: int = 2  # processes that collect, with any collector but single
 
     def __post_init__(self) -> None:
         """Refuse what no run can start with."""
-        for name in ("learners", "num_envs", "threads", "evaluation_episodes"):
+        for name in ("learners", "num_envs", "threads", "evaluation_episodes", "workers"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, but is {self.seed}")
         if not self.checkpoint_interval >= 0:
             raise ValueError(f"checkpoint_interval must not be negative, but is {self.checkpoint_interval}")
+        if self.collector in ("multi-sync", "ray") and self.num_envs % self.workers:
+            raise ValueError(
+                f"num_envs must be a multiple of workers, which share them out, but is {self.num_envs} "
+                f"for {self.workers}"
+            )
 
 
 @dataclass(frozen=True)
@@ -247,6 +259,7 @@ def learn(learner: Learner, options: RunOptions, folder: RunFolder, resumed: boo
     title = f"{options.task}, {options.learners} learners"
     saved = -math.inf  # s; the first update is saved, so that a failure leaves something to go on from
     with (
+        collected(learner, options),
         contextlib.closing(metrics),
         failures_of(learner, folder),
         StopRequest() as stop,
@@ -264,6 +277,28 @@ def learn(learner: Learner, options: RunOptions, folder: RunFolder, resumed: boo
         checkpoints.save(learner.updates)
     if stop.asked:
         print(f"stopped after {learner.frames} environment steps per learner", flush=True)
+
+
+@contextlib.contextmanager
+def collected(learner: Learner, options: RunOptions) -> Iterator[None]:
+    """Within it the collector of the options steps the learner's environments."""
+    if options.collector == "single":
+        yield
+        return
+    alone = options.collector == "multi-async"  # each worker makes whole rollouts
+    share = options.num_envs if alone else options.num_envs // options.workers
+    seeds = [options.seed + WORKER_SEEDS * (worker + 1) for worker in range(options.workers)]
+    factories = [functools.partial(make_env, options, share, seed) for seed in seeds]
+    given = factories, learner.policy, learner.config.rollout_steps, learner.critic
+    with mistakes_of_the_user():
+        if options.collector == "ray":
+            paths = {"runtime_env": {"env_vars": {"PYTHONPATH": str(Path(__file__).parent)}}}
+            collection = RayCollection(*given, ray_options=paths)
+        else:
+            collection = WorkerCollection(*given, asynchronous=alone)
+    learner.collection = collection  # pyright: ignore[reportAttributeAccessIssue]
+    with contextlib.closing(collection):
+        yield
 
 
 def conclude(learner: Learner, options: RunOptions, folder: RunFolder) -> None:

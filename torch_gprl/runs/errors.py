@@ -18,7 +18,7 @@ def mistakes_of_the_user() -> Iterator[None]:
     """Within it bad values become a `UserError`: some options only the task or the algorithm can judge."""
     try:
         yield
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, ModuleNotFoundError) as error:
         raise UserError(" ".join(str(error.args[0] if error.args else error).split())) from error
 
 

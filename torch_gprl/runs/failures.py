@@ -3,7 +3,7 @@
 import contextlib
 import traceback
 from collections.abc import Iterator
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from torch_gprl.runs.folder import RunFolder
 
@@ -15,6 +15,7 @@ class RunFailure(Exception):
     """
 
 
+@runtime_checkable
 class Counted(Protocol):
     """Something that learns by updates."""
 

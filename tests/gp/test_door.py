@@ -55,3 +55,11 @@ def test_points_of_the_wrong_shape_get_no_prediction(points, monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     with pytest.raises(ValueError, match="inputs must be"):
         process().posterior(points)
+
+
+def test_a_discount_of_the_wrong_shape_is_refused_before_anything_is_learned(monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    gp, (inputs, targets) = process(), sample(5)
+    with pytest.raises(ValueError, match=r"discount must be a number or \(5,\), one per input, got \(4,\)"):
+        gp.update(inputs, targets, stamp=4, next_inputs=inputs, discount=torch.full((4,), 0.9))
+    assert int(gp.size) == int(gp.clock) == 0

@@ -12,7 +12,7 @@ CHOICES = {"targets": Targets, "kernel": StateKernel}
 
 LEAST = {"total_frames": 1, "rollout_steps": 1, "budget": 1, "horizon": 1, "sweeps": 1, "candidates": 3}
 POSITIVE = ("noise", "lengthscale", "action_lengthscale", "novelty_threshold")
-SHARES = ("discount", "learning_rate", "growth")
+SHARES = ("learning_rate", "growth")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +21,7 @@ class QLearningConfig(Behaviour):
 
     total_frames: int = 5_000  # environment steps per learner, over all its environments
     rollout_steps: int = 25  # steps of each environment between two looks at the critic
-    discount: float = 0.95  # γ per environment step, from 0 to 1
+    discount: float = 0.95  # γ per environment step, at least 0 and below 1
 
     targets: Targets = "fitted"  # solve all experience anew, or the thesis' update of each rollout, once
     sweeps: int = 30  # most sweeps of value iteration in a solution; fitted
@@ -57,8 +57,13 @@ class QLearningConfig(Behaviour):
         for name in SHARES:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie between 0 and 1, got {getattr(self, name)}")
+        if not 0 <= self.discount < 1:
+            raise ValueError(f"discount must be at least 0 and below 1, got {self.discount}")
         if not math.isfinite(self.optimism):
             raise ValueError(f"optimism must be finite, got {self.optimism}")
+        self._check_choices()
+
+    def _check_choices(self) -> None:
         for name, kind in CHOICES.items():
             if getattr(self, name) not in get_args(kind):
                 choices = ", ".join(get_args(kind))

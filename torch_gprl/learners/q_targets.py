@@ -113,7 +113,7 @@ class Regression:
         cross = gp.kernel(gp.basis, inputs) * gp.mask.unsqueeze(-1)
         self.gram_factor = gp.gram_factor.clone()
         self.phi = torch.linalg.solve_triangular(self.gram_factor, cross, upper=False)
-        novelty = (gp.kernel.diag(inputs) - torch.linalg.vecdot(self.phi, self.phi, dim=-2)).clamp_min(0)
+        novelty = gp.kernel.diag(inputs) - torch.linalg.vecdot(self.phi, self.phi, dim=-2)
         self.weight = 1 / (gp.noise_variance.unsqueeze(-1) + novelty)
         precision = (self.phi * self.weight.unsqueeze(-2)) @ self.phi.mT
         precision.diagonal(dim1=-2, dim2=-1).add_(1)
@@ -196,7 +196,7 @@ class FittedQ:
         return self._target(data, value)
 
     def _target(self, data: Transitions, value: Tensor) -> Float[Tensor, "learners N"]:
-        """Y = r + γ V(s'), with V within the attainable range and 0 where s' is terminal."""
+        """The target r + γ V(s'), with V within the attainable range and 0 where s' is terminal."""
         low, high = data.range(self.config.discount)
         beyond = torch.where(data.terminated, 0.0, torch.clamp(value, low, high))
         return data.reward + self.config.discount * beyond

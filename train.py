@@ -80,10 +80,10 @@ from torch_gprl.runs.command_options import (
     TasksOptions,
 )
 
-CollectorName = Literal["single", "multi-sync", "multi-async", "ray"]
-WORKER_SEEDS = 1_000_003  # apart: workers' environments repeat neither each other's nor other runs' numbers
+CollectorName = Literal["multi-sync", "multi-async", "ray"]
 LONGEST_FILM = 300  # frames
 JUDGED_EPISODES = 5  # over which a critic's foresight is shown
+WORKER_STRIDE = 7_368_787  # keeps the seeds of workers apart; a prime above any count of runs
 PICTURES = Path(__file__).parent / "docs" / "tasks.jpg"
 
 
@@ -96,28 +96,27 @@ class RunOptions:
     num_envs: int = 5  # environments of each learner, stepped together
     seed: int = 0  # of all random numbers; the evaluation has a seed of its own
     threads: int = 1  # processor threads of torch and of the simulator
+    workers: int = 0  # processes that share the environments and collect side by side; 0 collects right here
+    collector: CollectorName = "multi-sync"  # of the workers: in step, each for itself, or on Ray's machines
     device: str = "cpu"  # where policy and critic live: cpu, cuda, cuda:1, ...
     out: Path | None = None  # run folder, new or empty; unless given runs/<task>-<algorithm>-<date>-<time>
     evaluation_episodes: int = 20  # episodes of the final evaluation, for each learner
     checkpoint_interval: float = 60.0  # s between checkpoints; changes no result
     logger: LoggerName = "tensorboard"  # of the curves, beside metrics.csv; csv writes that table alone
-    collector: CollectorName = "single"  # who steps the environments; workers' are not saved with checkpoints
-    workers: int = 2  # processes that collect, with any collector but single
 
     def __post_init__(self) -> None:
         """Refuse what no run can start with."""
-        for name in ("learners", "num_envs", "threads", "evaluation_episodes", "workers"):
+        for name in ("learners", "num_envs", "threads", "evaluation_episodes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.workers < 0 or (self.workers and self.num_envs % self.workers):
+            raise ValueError(f"workers must divide num_envs, {self.num_envs}, or be 0, but is {self.workers}")
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, but is {self.seed}")
         if not self.checkpoint_interval >= 0:
             raise ValueError(f"checkpoint_interval must not be negative, but is {self.checkpoint_interval}")
-        if self.collector in ("multi-sync", "ray") and self.num_envs % self.workers:
-            raise ValueError(
-                f"num_envs must be a multiple of workers, which share them out, but is {self.num_envs} "
-                f"for {self.workers}"
-            )
+        if self.collector != "multi-sync" and not self.workers:
+            raise ValueError(f"collector {self.collector} needs workers: say how many by --workers")
 
 
 @dataclass(frozen=True)
@@ -259,8 +258,8 @@ def learn(learner: Learner, options: RunOptions, folder: RunFolder, resumed: boo
     title = f"{options.task}, {options.learners} learners"
     saved = -math.inf  # s; the first update is saved, so that a failure leaves something to go on from
     with (
-        collected(learner, options),
         contextlib.closing(metrics),
+        collecting(learner, options),
         failures_of(learner, folder),
         StopRequest() as stop,
         Progress(learner.config.total_frames, title, before=learner.frames) as progress,
@@ -280,24 +279,24 @@ def learn(learner: Learner, options: RunOptions, folder: RunFolder, resumed: boo
 
 
 @contextlib.contextmanager
-def collected(learner: Learner, options: RunOptions) -> Iterator[None]:
-    """Within it the collector of the options steps the learner's environments."""
-    if options.collector == "single":
+def collecting(learner: Learner, options: RunOptions) -> Iterator[None]:
+    """Within it the learner's experience comes from as many processes as asked for."""
+    if not options.workers:
         yield
         return
     alone = options.collector == "multi-async"  # each worker makes whole rollouts
     share = options.num_envs if alone else options.num_envs // options.workers
-    seeds = [options.seed + WORKER_SEEDS * (worker + 1) for worker in range(options.workers)]
+    seeds = [options.seed + WORKER_STRIDE * worker for worker in range(options.workers)]
     factories = [functools.partial(make_env, options, share, seed) for seed in seeds]
     given = factories, learner.policy, learner.config.rollout_steps, learner.critic
     with mistakes_of_the_user():
         if options.collector == "ray":
-            paths = {"runtime_env": {"env_vars": {"PYTHONPATH": str(Path(__file__).parent)}}}
-            collection = RayCollection(*given, ray_options=paths)
+            paths = {"env_vars": {"PYTHONPATH": str(Path(__file__).parent)}}  # where workers find `envs`
+            workers = RayCollection(*given, ray_options={"runtime_env": paths})
         else:
-            collection = WorkerCollection(*given, asynchronous=alone)
-    learner.collection = collection  # pyright: ignore[reportAttributeAccessIssue]
-    with contextlib.closing(collection):
+            workers = WorkerCollection(*given, asynchronous=alone)
+    learner.collection = workers  # pyright: ignore[reportAttributeAccessIssue]
+    with contextlib.closing(workers):
         yield
 
 

@@ -11,8 +11,7 @@ import gymnasium
 import torch
 from torchrl.envs import EnvBase, GymWrapper, SerialEnv
 
-from torch_gprl.learners import PolicyGradient, PolicyGradientConfig
-from torch_gprl.learners.workers import WorkerCollection
+from torch_gprl.learners import PolicyGradient, PolicyGradientConfig, WorkerCollection
 
 LEARNERS = 2
 

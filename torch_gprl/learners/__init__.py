@@ -8,6 +8,8 @@ from torch_gprl.learners.dynamic_programming_config import DynamicProgrammingCon
 from torch_gprl.learners.policy_gradient import PolicyGradient
 from torch_gprl.learners.q_learning import QLearning
 from torch_gprl.learners.q_learning_config import QLearningConfig
+from torch_gprl.learners.ray_workers import RayCollection
+from torch_gprl.learners.workers import WorkerCollection
 
 __all__ = [
     "ActorCritic",
@@ -18,4 +20,6 @@ __all__ = [
     "PolicyGradientConfig",
     "QLearning",
     "QLearningConfig",
+    "RayCollection",
+    "WorkerCollection",
 ]

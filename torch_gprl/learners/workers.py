@@ -100,11 +100,12 @@ class WorkerCollection:
                 "cat_results": 1,
             }  # environments side by side
         self._collector = kind(
-            [functools.partial(_made, factory) for factory in self.factories],
+            [functools.partial(made, factory) for factory in self.factories],
             policy_factory=[functools.partial(FollowingPolicy, part, self._board.folder) for part in modules],
             total_frames=-1,
             weight_sync_schemes={"policy": NoWeightSyncScheme()},
             auto_register_policy_transforms=False,
+            init_fn=_leave_interrupts_to_the_learner,
             collector_class=functools.partial(ReportingCollector, reports=folder),
             **options,
         )
@@ -153,11 +154,20 @@ def copied_for_workers(modules: nn.ModuleDict, count: int) -> list[nn.ModuleDict
     """Copies of policy and critic that see each other as the originals do, with noise of their own."""
     copies = [copy.deepcopy(modules) for _ in range(count)]
     for original, *parts in zip(modules.modules(), *(one.modules() for one in copies), strict=True):
-        streams = [(name, value) for name, value in vars(original).items() if isinstance(value, NoiseStream)]
-        for name, stream in streams:
+        for name, stream in streams_of(original):
             for part, own in zip(parts, stream.split(count), strict=True):
                 setattr(part, name, own)
     return copies
+
+
+def streams_of(module: nn.Module) -> list[tuple[str, NoiseStream]]:
+    """The streams of random numbers that a module itself holds, by name."""
+    return [(name, value) for name, value in vars(module).items() if isinstance(value, NoiseStream)]
+
+
+def _leave_interrupts_to_the_learner() -> None:
+    """Ctrl-C reaches all processes of a terminal; the learner ends its workers in its own time."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _exit_code(process: BaseProcess) -> int | None:
@@ -168,7 +178,7 @@ def _exit_code(process: BaseProcess) -> int | None:
         return None
 
 
-def _made(factory: Callable[[], EnvBase]) -> EnvBase:
+def made(factory: Callable[[], EnvBase]) -> EnvBase:
     """A worker's environment, watched as `Collection` watches its own."""
     torch.set_num_threads(1)
     return watched(factory())

@@ -4,7 +4,8 @@
 
 Every arm has the same learner, environments and starts, learner by learner, so that arms are compared in
 pairs. The tuned noise is the best of four standard deviations on the very same seeds, which favours it. Each
-finished arm is kept in --out; a second call runs what is missing. Leaves exploration.json and pictures there.
+finished group of learners is kept in --out; a second call runs what is missing. Leaves exploration.json and
+pictures there.
 """
 
 import dataclasses
@@ -25,6 +26,7 @@ from benchmarks.exploration_arms import ARMS, GAUSSIAN, MATCHED, SETTINGS, Outco
 from benchmarks.exploration_pictures import Snapshots, draw
 
 SHOWN = ("steps to threshold", "steps to discovery", "final return", "time in goal", "entropy of cells")
+GROUP = 10  # learners of one program
 QUICK_LEARNERS, QUICK_SHARE = 4, 5  # learners, and the part of the steps that a quick run takes
 
 
@@ -57,50 +59,54 @@ def main(options: Options) -> None:
         report(setting, options.out)
 
 
-def record_of(setting: Setting, arm: str, out: Path) -> Path:
-    """Where a finished arm is kept."""
-    return out / f"{setting.task} {arm}.pt"
+def record_of(setting: Setting, arm: str, first: int, out: Path) -> Path:
+    """Where a finished group of learners is kept, by its first one."""
+    return out / f"{setting.task} {arm} {first}.pt"
 
 
 def complete(setting: Setting, arm: str, options: Options, progress: Progress) -> None:
-    """Run an arm unless it is done; the matched one waits for the confidence that it is matched with."""
-    path = record_of(setting, arm, options.out)
+    """Run the groups of an arm that are missing; the matched one waits for what it is matched with."""
     frames = setting.frames // (QUICK_SHARE if options.quick else 1)
-    if path.exists() and torch.load(path, weights_only=True)["learners"] == options.learners:
-        return
     numbers = ARMS.get(arm)
     if numbers is None:
-        confidence = record_of(setting, "confidence", options.out)
-        if not confidence.exists():
+        confidence = load(setting, "confidence", options.out)
+        if confidence is None:
             return
-        measured = load(confidence)[0].measures(setting)["mean sigma"]
-        numbers = {"std": measured.square().mean().sqrt().item()}
-    bar = progress.add_task(f"{setting.task}, {arm}", total=frames)
-    pictures = Snapshots(setting)
-    for learner, outcome in run(setting, numbers, range(options.learners), frames):
-        progress.update(bar, completed=learner.frames)
-        pictures.take(learner)
-        last = outcome
-    fields = {name: getattr(last, name) for name in Outcome.__dataclass_fields__}
-    kept = {"learners": options.learners, "numbers": numbers, "pictures": pictures.taken, **fields}
-    torch.save(kept, path.with_suffix(".part"))
-    path.with_suffix(".part").replace(path)
+        σ = confidence[0].measures(setting)["mean sigma"]
+        numbers = {"std": σ.square().mean().sqrt().item()}
+    for first in range(0, options.learners, GROUP):
+        path = record_of(setting, arm, first, options.out)
+        if path.exists():
+            continue
+        learners = range(first, min(first + GROUP, options.learners))
+        bar = progress.add_task(f"{setting.task}, {arm}, learner {first} and on", total=frames)
+        pictures = Snapshots(setting)
+        for learner, outcome in run(setting, numbers, learners, frames):
+            progress.update(bar, completed=learner.frames)
+            pictures.take(learner)
+            kept = {"outcome": dataclasses.asdict(outcome), "pictures": pictures.taken, "numbers": numbers}
+        torch.save(kept, path.with_suffix(".part"))
+        path.with_suffix(".part").replace(path)
 
 
-def load(path: Path) -> tuple[Outcome, dict[str, Any]]:
-    """What an arm did, and what was pictured of it."""
-    kept = torch.load(path, weights_only=True)
-    return Outcome(**{name: kept[name] for name in Outcome.__dataclass_fields__}), kept["pictures"]
+def load(setting: Setting, arm: str, out: Path) -> tuple[Outcome, dict[str, Any]] | None:
+    """What the finished groups of an arm did, and the pictures of the first; none if there is no group."""
+    paths = sorted(out.glob(f"{setting.task} {arm} [0-9]*.pt"), key=lambda path: int(path.stem.split()[-1]))
+    groups = [torch.load(path, weights_only=True) for path in paths]
+    if not groups:
+        return None
+    parts = [Outcome(**group["outcome"]) for group in groups]
+    return Outcome.of_all(parts), groups[0]["pictures"]
 
 
 def report(setting: Setting, out: Path) -> None:
     """Table, JSON and pictures of all arms of a task that are done."""
-    done = {arm: record_of(setting, arm, out) for arm in (*ARMS, MATCHED)}
-    loaded = {arm: load(path) for arm, path in done.items() if path.exists()}
+    tried = {arm: load(setting, arm, out) for arm in (*ARMS, MATCHED)}
+    loaded = {arm: kept for arm, kept in tried.items() if kept is not None}
     measures = {arm: outcome.measures(setting) for arm, (outcome, _) in loaded.items()}
-    tried = [arm for arm in GAUSSIAN if arm in measures]
+    noises = [arm for arm in GAUSSIAN if arm in measures]
     # the best σ: the earliest on average, then the best at the end
-    tuned = min(tried, key=lambda arm: _rank(measures[arm]), default=None)
+    tuned = min(noises, key=lambda arm: _rank(measures[arm]), default=None)
     found = {arm: summarise(one, measures.get(tuned or "")) for arm, one in measures.items()}
     _show(setting, found, tuned)
     path = out / "exploration.json"
@@ -136,9 +142,9 @@ def summarise(
 
 def _paired(values: torch.Tensor, baseline: torch.Tensor) -> float:
     """Wilcoxon's signed-rank test of paired seeds, two-sided; 1 if nothing differs."""
-    if len(values) != len(baseline) or torch.equal(values, baseline):
-        return 1.0
-    return float(wilcoxon((values - baseline).numpy()).pvalue)
+    pairs = min(len(values), len(baseline))  # an arm may still miss a group
+    difference = (values[:pairs] - baseline[:pairs]).numpy()
+    return float(wilcoxon(difference).pvalue) if difference.any() else 1.0  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _show(setting: Setting, found: dict[str, dict[str, Any]], tuned: str | None) -> None:

@@ -5,7 +5,7 @@ the first uniform actions; only what is done between the solutions differs.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -150,6 +150,12 @@ class Outcome:
     sigma: Float[Tensor, "learners U"]  # root mean square distance to the greedy action, by update, in halves
     reward: Float[Tensor, "learners T"]
 
+    @classmethod
+    def of_all(cls, groups: Sequence["Outcome"]) -> "Outcome":
+        """Groups of learners as one."""
+        names = ("returns", "states", "sigma", "reward")
+        return cls(groups[0].frames, *(torch.cat([getattr(one, name) for one in groups]) for name in names))
+
     def measures(self, setting: Setting) -> dict[str, Tensor]:
         """Figures of each learner [learners]."""
         index = (self.states * CELLS).long()
@@ -164,7 +170,8 @@ class Outcome:
             "time in goal": (self.reward >= setting.goal).double().mean(1),
             "entropy of cells": -torch.xlogy(share, share).sum(1),
             "new cells per 1,000 steps": (counts > 0).sum(1) * 1000 / self.states.shape[1],
-            "mean sigma": self.sigma[:, 4:].square().mean(1).sqrt(),  # without the uniform beginning
+            # without the first rollout, whose actions are uniform
+            "mean sigma": self.sigma[:, 1 if self.sigma.shape[1] > 1 else 0 :].square().mean(1).sqrt(),
         }
 
 
@@ -174,7 +181,7 @@ def steps_to(frames: list[int], returns: Float[Tensor, "learners K"], setting: S
     Learners that never get there, or only in the last evaluation, count as one evaluation after the end.
     """
     above = returns >= setting.threshold
-    sustained = above[:, :-1] & above[:, 1:]
+    sustained = above & torch.cat([above[:, 1:], torch.zeros_like(above[:, :1])], 1)
     ends = torch.tensor([*frames, frames[-1] + setting.every], dtype=torch.float64)
     first = torch.where(sustained.any(1), sustained.int().argmax(1), len(frames))
     return ends[first]

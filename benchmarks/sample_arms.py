@@ -198,6 +198,7 @@ class PeerPolicy(TensorDictModuleBase):
 ARMS = {
     "q-learning": ours("QLearning"),
     "actor-critic": ours("ActorCritic"),
+    "dynamic programming": ours("DynamicProgramming"),
     "PPO": peer("PPO", PPO_SETTINGS),
     "SAC": peer("SAC", SAC_SETTINGS),
     "SAC small": peer("SAC", {}, SMALL_SAC),

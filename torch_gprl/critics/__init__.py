@@ -12,12 +12,14 @@ from torch_gprl.critics.kernels_by_name import (
     graphs,
     store_transitions,
 )
+from torch_gprl.critics.maximise import ActionMaximiser, Maximum
 from torch_gprl.critics.returns import k_step_returns
 from torch_gprl.critics.value_estimator import Critic, GPStateValue, GPValueEstimator
 
 __all__ = [
     "ESTIMATORS",
     "USE_ALL_ACTIONS",
+    "ActionMaximiser",
     "Critic",
     "EstimatorName",
     "Evaluation",
@@ -25,6 +27,7 @@ __all__ = [
     "GPStateValue",
     "GPValueEstimator",
     "KernelName",
+    "Maximum",
     "action_moments",
     "action_value_kernel",
     "clear_graphs",

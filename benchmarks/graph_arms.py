@@ -5,7 +5,6 @@ tuned on a graph that lacks them, since a graph tells more of its own vertices t
 online process then learns from all trajectories in random blocks, graphs growing along.
 """
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import LogNormal
 
-from benchmarks.graph_pendulum import DISCOUNT, Trajectories
+from benchmarks.graph_systems import DISCOUNT, Trajectories
+from torch_gprl.critics.kernels_by_name import successor_with_rest
 from torch_gprl.gp import Posterior, SparseOnlineGP, fit_hyperparameters
 from torch_gprl.graphs import Experience, NearestEdges, ThresholdEdges, TransitionGraph
 from torch_gprl.kernels import (
@@ -25,11 +25,8 @@ from torch_gprl.kernels import (
     Matern,
     ShortestPathKernel,
     SquaredExponential,
-    SuccessorKernel,
 )
-from torch_gprl.kernels.graph_successor import FIRST_DOUBT
 
-DIMS = 3
 BLOCK = 250  # points of one update
 MOST_NODES = 300  # of a graph of basis vectors: a budget with its overshoot
 TUNING_NODES = 100
@@ -38,8 +35,7 @@ HELD_OUT = 2  # one trajectory in so many is held out of the graph while its ker
 NEIGHBOURS = 4
 PRINTED_THRESHOLD = 0.7
 LOOKAHEAD = 20  # steps
-REST = 0.2  # prior variance of what the successor kernel cannot tell
-PRIOR_WIDTH = 0.3  # standard deviation of logarithms
+WIDE = 1.5  # standard deviation of logarithms of the amplitudes of a mixture
 
 Graph = TransitionGraph | Experience | None
 
@@ -48,8 +44,8 @@ Graph = TransitionGraph | Experience | None
 class Arm:
     """One kernel: how to make it, and on what it stands."""
 
-    graph: Callable[[int], Graph]  # from the number of transitions that will be stored
-    kernel: Callable[[Graph], Kernel]
+    graph: Callable[[int, int], Graph]  # from input columns and the number of transitions that will be stored
+    kernel: Callable[[Graph, int], Kernel]  # from the graph and input columns
 
 
 @dataclass(frozen=True)
@@ -61,20 +57,20 @@ class Learned:
     learning: float
 
 
-def _nodes(transitions: int) -> TransitionGraph:
-    return TransitionGraph(DIMS, MOST_NODES, NearestEdges(NEIGHBOURS))
+def _nodes(dims: int, transitions: int) -> TransitionGraph:
+    return TransitionGraph(dims, MOST_NODES, NearestEdges(NEIGHBOURS))
 
 
-def _visited(transitions: int) -> Experience:
-    return Experience(DIMS, transitions)
+def _visited(dims: int, transitions: int) -> Experience:
+    return Experience(dims, transitions)
 
 
-def _none(transitions: int) -> None:
+def _none(dims: int, transitions: int) -> None:
     return None
 
 
 def _on_nodes(kernel: Callable[[TransitionGraph], Kernel]) -> Arm:
-    def make(graph: Graph) -> Kernel:
+    def make(graph: Graph, dims: int) -> Kernel:
         assert isinstance(graph, TransitionGraph)
         return kernel(graph)
 
@@ -82,33 +78,33 @@ def _on_nodes(kernel: Callable[[TransitionGraph], Kernel]) -> Arm:
 
 
 def _on_experience(kernel: Callable[[Experience], Kernel]) -> Arm:
-    def make(graph: Graph) -> Kernel:
+    def make(graph: Graph, dims: int) -> Kernel:
         assert isinstance(graph, Experience)
         return kernel(graph)
 
     return Arm(_visited, make)
 
 
-def _successor(visited: Experience, lookahead: int) -> Kernel:
-    """With an ordinary kernel for what it cannot tell, and priors that keep this one from vanishing.
+def _geodesic_mixed(visited: Experience) -> Kernel:
+    """The sum with an ordinary kernel; the marginal likelihood says how much of each."""
+    told = GeodesicKernel(visited, DISCOUNT, outputscale=0.5)
+    ordinary = Matern(told.input_dim, outputscale=0.5)
+    for kernel in (told, ordinary):
+        kernel.set_prior("outputscale", LogNormal(-1.0, WIDE))
+    return told + ordinary
 
-    Without priors the marginal likelihood of a few hundred returns, most of them told exactly by the graph,
-    leaves no variance for the few that are not.
-    """
-    told, rest = SuccessorKernel(visited, DISCOUNT, lookahead=lookahead), Matern(DIMS, smoothness=0.5)
-    rest.outputscale = REST
-    for kernel in (told, rest):
-        kernel.set_prior("lengthscale", LogNormal(0.0, PRIOR_WIDTH))
-    told.set_prior("outputscale", LogNormal(0.0, PRIOR_WIDTH))
-    told.set_prior("doubt", LogNormal(math.log(FIRST_DOUBT), PRIOR_WIDTH))
-    rest.set_prior("outputscale", LogNormal(math.log(REST), PRIOR_WIDTH))
-    return told + rest
+
+def _successor_mixed(visited: Experience) -> Kernel:
+    """The successor kernel with what it cannot tell, and a smooth kernel of any amplitude beside it."""
+    ordinary = Matern(visited.states.shape[-1], outputscale=0.2)
+    ordinary.set_prior("outputscale", LogNormal(-1.0, WIDE))
+    return successor_with_rest(visited, DISCOUNT, 1.0, LOOKAHEAD) + ordinary
 
 
 EUCLIDEAN = {
-    "squared exponential": Arm(_none, lambda graph: SquaredExponential(DIMS)),
-    "Matérn 1/2": Arm(_none, lambda graph: Matern(DIMS, smoothness=0.5)),
-    "Matérn 3/2": Arm(_none, lambda graph: Matern(DIMS)),
+    "squared exponential": Arm(_none, lambda graph, dims: SquaredExponential(dims)),
+    "Matérn 1/2": Arm(_none, lambda graph, dims: Matern(dims, smoothness=0.5)),
+    "Matérn 3/2": Arm(_none, lambda graph, dims: Matern(dims)),
 }
 ON_GRAPHS = {
     "shortest path, nearest (.20)": _on_nodes(lambda graph: ShortestPathKernel(graph)),
@@ -120,8 +116,12 @@ ON_GRAPHS = {
     ),
     "graph Matérn 3/2": _on_nodes(lambda graph: GraphMatern(graph, interpolate=NEIGHBOURS)),
     "geodesic": _on_experience(lambda visited: GeodesicKernel(visited, DISCOUNT)),
-    "successor, no look-ahead": _on_experience(lambda visited: _successor(visited, 0)),
-    "successor": _on_experience(lambda visited: _successor(visited, LOOKAHEAD)),
+    "successor, no look-ahead": _on_experience(
+        lambda visited: successor_with_rest(visited, DISCOUNT, 1.0, 0)
+    ),
+    "successor": _on_experience(lambda visited: successor_with_rest(visited, DISCOUNT, 1.0, LOOKAHEAD)),
+    "geodesic + Matérn 3/2": _on_experience(_geodesic_mixed),
+    "successor + Matérn 3/2": _on_experience(_successor_mixed),
 }
 ARMS = EUCLIDEAN | ON_GRAPHS
 
@@ -133,8 +133,9 @@ class Tuned:
         """Tune; `steps` of the optimiser, from a noise variance of `noise`."""
         torch.manual_seed(seed)
         self.seen = seen
-        self.graph = arm.graph(seen.targets.numel())
-        self.kernel = arm.kernel(self.graph)
+        dims = seen.states.shape[-1]
+        self.graph = arm.graph(dims, seen.targets.numel())
+        self.kernel = arm.kernel(self.graph, dims)
         start = time.perf_counter()
         kept = torch.arange(len(seen.targets)) % HELD_OUT != 0
         grow(self.graph, seen, kept)
@@ -171,7 +172,7 @@ def grow(graph: Graph, seen: Trajectories, which: Tensor) -> None:
     if isinstance(graph, Experience):
         graph.add(states, next_states)
     else:
-        spread = Experience(DIMS, len(states), TUNING_NODES)
+        spread = Experience(states.shape[-1], len(states), TUNING_NODES)
         spread.add(states, next_states)
         graph.add(states[spread.landmarks])
 
@@ -191,8 +192,9 @@ def printed(
         noise: ridge of least squares.
         nodes: basis vectors, spread out over the states.
     """
-    graph = TransitionGraph(DIMS, nodes, ThresholdEdges(PRINTED_THRESHOLD, squared=True))
-    visited = Experience(DIMS, seen.targets.numel(), nodes)
+    dims = seen.states.shape[-1]
+    graph = TransitionGraph(dims, nodes, ThresholdEdges(PRINTED_THRESHOLD, squared=True))
+    visited = Experience(dims, seen.targets.numel(), nodes)
     states, targets = seen.states.flatten(0, 1), seen.targets.flatten()
     visited.add(states, seen.next_states.flatten(0, 1))
     graph.add(states[visited.landmarks])

@@ -2,9 +2,9 @@
 
     python -m benchmarks.graph_kernels [--quick] [--seeds 20] [--out runs/graph-kernels]
 
-Fixed policies on the pendulum, their true values by brute force, the same trajectories and budgets for every
-kernel, hyper-parameters by marginal likelihood. Leaves graph_kernels.json, the surfaces of Fig. .3 and the
-graph over the state plane in --out.
+Fixed policies on pendulum, cart-pole and Atwood's machine, their true values by brute force, the same
+trajectories and budgets for every kernel, hyper-parameters by marginal likelihood. Leaves graph_kernels.json,
+the surfaces of Fig. .3, the graph over the state plane and its connectivity in --out.
 """
 
 import json
@@ -21,17 +21,26 @@ from rich.table import Table
 from torch import Tensor
 
 from benchmarks.graph_arms import ARMS, EUCLIDEAN, TUNING_NODES, Tuned, grow, printed
-from benchmarks.graph_pendulum import Problem, Trajectories, Truth, experience, inputs, true_values
-from benchmarks.graph_pictures import draw_graph, draw_surfaces
+from benchmarks.graph_machines import Atwood, CartPole, Jump, Spiral
+from benchmarks.graph_pictures import draw_connectivity, draw_graph, draw_surfaces
+from benchmarks.graph_systems import System, Trajectories, Truth, experience, true_values
 from torch_gprl.gp import Posterior
 from torch_gprl.graphs import NearestEdges, ThresholdEdges, TransitionGraph
+from torch_gprl.graphs.edges import EdgeRule
 
 TARGET_NOISE = 0.1  # standard deviation on targets, in those of the value
 MODEL_ERROR = 1e-3  # variance that every predictive density has at least, in squared deviations of the value
 MEMORY = 800  # basis vectors of the Euclidean kernel that remembers as much as a graph of visited states
 NOISY_TORQUE = 0.7  # N m
-THRESHOLDS = (0.95, 0.9, 0.8, 0.7)  # of equation (.18)
-PROBLEMS = (Problem("jump"), Problem("spiral"), Problem("jump", NOISY_TORQUE, 40))
+THRESHOLDS = (0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4)  # of equation (.18)
+PROBLEMS = (
+    Jump(),
+    Spiral(),
+    Jump(NOISY_TORQUE, 40),
+    CartPole(),
+    Atwood(),
+    Jump(action_values=True),
+)
 
 
 @dataclass(frozen=True)
@@ -43,7 +52,9 @@ class Options:
     budgets: tuple[int, ...] = (50, 100, 200)  # basis vectors
     trajectories: int = 60
     steps: int = 50  # transitions of each trajectory
-    cells: int = 60  # of the grid of true values, in each direction
+    states: int = 1_500  # of true values: random ones, on the pendulum a grid of twice as many
+    problems: tuple[str, ...] = ()  # names of those to look at; all unless told
+    kernels: tuple[str, ...] = ()  # names of those to compare; all unless told
     tuning_steps: int = 30  # of the optimiser of the marginal likelihood
     out: Path = field(default_factory=lambda: Path("runs/graph-kernels"))  # where results go
 
@@ -73,23 +84,41 @@ def main(options: Options) -> None:
     scores: list[Score] = []
     graphs: list[dict[str, object]] = []
     for problem in PROBLEMS:
+        if options.problems and problem.name not in options.problems:
+            continue
         torch.manual_seed(0)
-        truth = true_values(problem, options.cells)
+        truth = true_values(problem, states_to_judge(problem, options.states))
         for seed in range(seeds):
             seen = experience(problem, truth, seed, options.trajectories, options.steps, TARGET_NOISE)
             surfaces, found = compare(problem, truth, seen, seed, budgets, options)
             scores += found
             print(f"{problem.name}, seed {seed}: {best(found)}", flush=True)
             if seed == 0:
-                draw_surfaces(truth, surfaces, options.out / f"surfaces_{problem.file_name}.png")
-                draw_graph(truth, seen, options.out / f"graph_{problem.file_name}.png")
+                if is_plane(problem):
+                    draw_surfaces(truth, surfaces, options.out / f"surfaces_{problem.file_name}.png")
+                    draw_graph(truth, seen, options.out / f"graph_{problem.file_name}.png")
                 graphs += connectivity(problem, seen)
+                draw_connectivity(graphs, options.out / "connectivity.png")
         write(scores, graphs, options)
     show(scores)
 
 
+def is_plane(problem: System) -> bool:
+    """Whether the values are a picture over angle and speed."""
+    return isinstance(problem, Jump) and not problem.action_values
+
+
+def states_to_judge(problem: System, count: int) -> Tensor:
+    """A grid over the plane, or random states."""
+    if not is_plane(problem):
+        return problem.sample(count)
+    cells = math.isqrt(2 * count)
+    lines = [torch.linspace(-extent, extent, cells, dtype=torch.float64) for extent in problem.extent]
+    return torch.cartesian_prod(*lines)
+
+
 def compare(
-    problem: Problem,
+    problem: System,
     truth: Truth,
     seen: Trajectories,
     seed: int,
@@ -97,7 +126,7 @@ def compare(
     options: Options,
 ) -> tuple[dict[str, Tensor], list[Score]]:
     """All kernels on one set of trajectories: their surfaces at the largest budget, and their scores."""
-    queries, noise = inputs(truth.states), TARGET_NOISE**2
+    queries, noise = truth.points, TARGET_NOISE**2
     surfaces: dict[str, Tensor] = {}
     scores: list[Score] = []
 
@@ -105,7 +134,8 @@ def compare(
         surfaces[f"{kernel}, {MEMORY} kept" if budget == MEMORY else kernel] = posterior.mean
         scores.append(Score(problem.name, kernel, budget, seed, *errors(truth, posterior), *seconds))
 
-    for name, arm in ARMS.items():
+    arms = {name: arm for name, arm in ARMS.items() if not options.kernels or name in options.kernels}
+    for name, arm in arms.items():
         tuned = Tuned(arm, seen, seed, options.tuning_steps, noise)
         with_memory = {"Matérn 1/2": (*budgets, MEMORY)}
         for budget in with_memory.get(name, budgets):
@@ -129,7 +159,8 @@ def errors(truth: Truth, posterior: Posterior) -> tuple[float, float, float, flo
     variance = posterior.variance + MODEL_ERROR
     nlpd = 0.5 * (square / variance + (2 * math.pi * variance).log())
     parts = (square, square[truth.near], square[~truth.near])
-    return (*(float(part.mean().sqrt()) for part in parts), float(nlpd.mean()))
+    rmse, near, far = (float(part.mean().sqrt()) for part in parts)
+    return rmse, near, far, float(nlpd.mean())
 
 
 def best(scores: list[Score]) -> str:
@@ -145,7 +176,8 @@ def show(scores: list[Score]) -> None:
         by_kernel = {
             name: [s for s in here if s.kernel == name] for name in dict.fromkeys(s.kernel for s in here)
         }
-        euclidean = min(mean(by_kernel[name], "rmse") for name in EUCLIDEAN if name in by_kernel)
+        rmses = [mean(by_kernel[name], "rmse") for name in EUCLIDEAN if name in by_kernel]
+        euclidean = min(rmses, default=math.nan)
         columns = ("RMSE", "± seeds", "gain", "near", "far", "NLPD", "tune s", "learn s", "predict s")
         table = Table("kernel", *columns, title=f"{problem}, {budget} basis vectors")
         for name, runs in by_kernel.items():
@@ -159,9 +191,10 @@ def show(scores: list[Score]) -> None:
         Console(width=140).print(table)
 
 
-def connectivity(problem: Problem, seen: Trajectories) -> list[dict[str, object]]:
+def connectivity(problem: System, seen: Trajectories) -> list[dict[str, object]]:
     """How sparse graphs of spread-out states are, and into how many parts they fall, by the rule of edges."""
-    rules = {f"threshold {t}": ThresholdEdges(t) for t in THRESHOLDS} | {"4 nearest": NearestEdges(4)}
+    rules: dict[str, EdgeRule] = {f"threshold {t}": ThresholdEdges(t) for t in THRESHOLDS}
+    rules["4 nearest"] = NearestEdges(4)
     found: list[dict[str, object]] = []
     for name, rule in rules.items():
         graph = TransitionGraph(seen.states.shape[-1], TUNING_NODES, rule)

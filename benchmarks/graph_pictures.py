@@ -9,12 +9,14 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.graph_pendulum import FASTEST, SPEED_UNIT, Trajectories, Truth
+from benchmarks.graph_machines import SPEED_UNIT, Jump
+from benchmarks.graph_systems import Trajectories, Truth
 from torch_gprl.graphs import Experience, NearestEdges, TransitionGraph
 
 NODES = 100
 NEIGHBOURS = 4
 PANELS_PER_ROW = 4
+FASTEST = Jump.extent[1]
 
 
 def draw_surfaces(truth: Truth, surfaces: dict[str, Tensor], path: Path) -> None:
@@ -57,6 +59,24 @@ def draw_graph(truth: Truth, seen: Trajectories, path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
+def draw_connectivity(graphs: list[dict[str, object]], path: Path) -> None:
+    """How dense graphs are, and into how many parts they fall, against the threshold of their edges."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    for axes, key in zip(figure.subplots(1, 2), ("mean degree", "parts"), strict=True):
+        for problem in dict.fromkeys(str(graph["problem"]) for graph in graphs):
+            rows = [
+                (float(str(graph["edges"]).split()[-1]), graph[key])
+                for graph in graphs
+                if graph["problem"] == problem and str(graph["edges"]).startswith("threshold")
+            ]
+            axes.plot(*zip(*rows, strict=True), "o-", label=problem, markersize=4)
+        axes.set(xlabel="threshold of equation (.18)", ylabel=key, yscale="symlog")
+        axes.grid(alpha=0.25, linewidth=0.5)
+    figure.axes[0].legend(frameon=False, fontsize="small")
+    figure.suptitle(f"graphs of {NODES} spread-out states", fontsize="medium")
+    figure.savefig(path, dpi=130)
+
+
 def _surface(axes: Axes, truth: Truth, values: Tensor) -> None:
     cells = math.isqrt(len(values))
     low, high = float(truth.values.min()), float(truth.values.max())
@@ -74,5 +94,7 @@ def _lines(axes: Axes, start: Tensor, end: Tensor, color: str) -> None:
     """Edges that do not cross the cut at ±π."""
     segments = torch.stack((_plane(start), _plane(end)), -2)
     whole = (segments[:, 0, 0] - segments[:, 1, 0]).abs() < math.pi
-    axes.add_collection(LineCollection(segments[whole].numpy(), colors=color, linewidths=0.6, alpha=0.8))
+    axes.add_collection(
+        LineCollection(list(segments[whole].numpy()), colors=color, linewidths=0.6, alpha=0.8)
+    )
     axes.set_ylim(-FASTEST, FASTEST)

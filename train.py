@@ -193,8 +193,9 @@ def start(name: str, options: Options) -> None:
     print(
         f"{name} on {options.run.task}: {options.run.learners} learners, results in {folder.path}", flush=True
     )
-    learn(learner, options.run, folder)
-    conclude(learner, options.run, folder)
+    with failures_of(learner, folder):
+        learn(learner, options.run, folder)
+        conclude(learner, options.run, folder)
 
 
 def resume(options: ResumeOptions) -> None:
@@ -202,8 +203,9 @@ def resume(options: ResumeOptions) -> None:
     run = opened(options)
     check_logger(run.options.logger)
     print(f"going on after update {run.learner.updates} in {run.folder.path}", flush=True)
-    learn(run.learner, run.options, run.folder, resumed=True)
-    conclude(run.learner, run.options, run.folder)
+    with failures_of(run.learner, run.folder):
+        learn(run.learner, run.options, run.folder, resumed=True)
+        conclude(run.learner, run.options, run.folder)
 
 
 class Opened(NamedTuple):
@@ -260,7 +262,6 @@ def learn(learner: Learner, options: RunOptions, folder: RunFolder, resumed: boo
     with (
         contextlib.closing(metrics),
         collecting(learner, options),
-        failures_of(learner, folder),
         StopRequest() as stop,
         Progress(learner.config.total_frames, title, before=learner.frames) as progress,
     ):

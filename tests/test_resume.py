@@ -2,6 +2,7 @@
 
 import os
 import random
+import resource
 import signal
 import time
 from pathlib import Path
@@ -18,13 +19,15 @@ SMALL = {
 COMMON = "--learners 2 --num-envs 2 --logger csv --checkpoint-interval"
 
 
-def in_a_process(arguments: list[str]) -> int:
+def in_a_process(arguments: list[str], longest_file: int | None = None) -> int:
     """Start the command line in a fork, which needs no new imports; returns its process id."""
     child = os.fork()
     if child == 0:
         os.setsid()
         code = 70
         try:
+            if longest_file is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (longest_file, resource.RLIM_INFINITY))
             for stream in (1, 2):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
             code = train.main(arguments)
@@ -33,9 +36,9 @@ def in_a_process(arguments: list[str]) -> int:
     return child
 
 
-def run(arguments: list[str], kill_after: float | None = None) -> int | None:
+def run(arguments: list[str], kill_after: float | None = None, longest_file: int | None = None) -> int | None:
     """The exit code, or None if the run was killed after some seconds."""
-    child = in_a_process(arguments)
+    child = in_a_process(arguments, longest_file)
     if kill_after is not None:
         time.sleep(kill_after)
         os.kill(child, signal.SIGKILL)
@@ -59,8 +62,8 @@ def resumed_metrics(arguments: list[str], folder: Path, moments: list[float]) ->
     """Start, kill and resume, once for each moment, then to the end."""
     command = [*arguments, "--out", str(folder)]
     for moment in moments:
-        if run(command, kill_after=moment) is not None:
-            break
+        if run(command, kill_after=moment) == 0:  # it was faster
+            return (folder / "metrics.csv").read_bytes()
         started = (folder / "config.yaml").exists()
         command = ["--resume", str(folder)] if started else [*arguments, "--out", str(folder / "again")]
         folder = folder if started else folder / "again"
@@ -82,6 +85,16 @@ def test_a_killed_run_resumes_bit_for_bit(undisturbed, tmp_path):
     arguments, metrics, _ = undisturbed
     assert metrics.count(b"\n") == 17  # a header, and 8 updates of two learners
     kill_points(undisturbed, tmp_path, 3 if "policy-gradient" in arguments else 1)
+
+
+def test_a_run_that_filled_the_disk_resumes_bit_for_bit(undisturbed, tmp_path):
+    arguments, metrics, _ = undisturbed
+    folder = tmp_path / "run"
+    full = 8000  # bytes: room for options and the first metrics, not for a checkpoint
+    assert run([*arguments, "0", "--out", str(folder)], longest_file=full) == 1
+    assert list((folder / "checkpoints").glob("checkpoint-*.torchrl")) == []
+    assert run(["--resume", str(folder)]) == 0
+    assert (folder / "metrics.csv").read_bytes() == metrics
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import importlib.util
+import os
 import re
 import shutil
 import signal
@@ -376,3 +377,29 @@ def test_constant_rewards_and_episodes_of_one_step_are_no_faults(name, oddity, t
     assert np.isfinite(metrics["basis_size"]).all()
     if oddity == "ends":
         assert np.isfinite(metrics["return"]).all()  # an episode ends at every step
+
+
+# ---------------------------------------------------------------- several processes
+
+
+WORKERS = f"--workers 2 {SIZES} --rollout-steps 20"
+
+
+@pytest.mark.slow
+def test_a_killed_worker_ends_the_run_with_its_cause_and_a_checkpoint(tmp_path):
+    folder = tmp_path / "run"
+    command = f"policy-gradient {WORKERS} --total-frames 1000000000".split()
+    process = start(*command, "--out", str(folder))
+    metrics = folder / "metrics.csv"
+    wait_for(lambda: metrics.exists() and metrics.read_text(encoding="utf-8").count("\n") > 2, process)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text(encoding="utf-8").split()
+    names = {child: Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8") for child in children}
+    worker = next(child for child, name in names.items() if "spawn_main" in name)
+    os.kill(int(worker), signal.SIGKILL)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert re.search(
+        r"failed after update \d+ by RuntimeError: a worker failed: worker-0 .*--resume .*",
+        errors.splitlines()[-1],
+    )
+    assert len(list((folder / "checkpoints").iterdir())) == 1

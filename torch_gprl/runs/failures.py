@@ -5,6 +5,7 @@ import traceback
 from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
 
+from torch_gprl.runs.errors import UserError
 from torch_gprl.runs.folder import RunFolder
 
 
@@ -27,6 +28,8 @@ def failures_of(learner: Counted, folder: RunFolder) -> Iterator[None]:
     """Within it whatever breaks becomes a `RunFailure`, and its trace goes into the run's folder."""
     try:
         yield
+    except UserError:
+        raise
     except Exception as error:
         with contextlib.suppress(OSError):  # the disk may be what failed
             folder.failure.write_text(traceback.format_exc(), encoding="utf-8")

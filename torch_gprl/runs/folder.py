@@ -124,6 +124,9 @@ class RunFolder:
 
         Args:
             options: the resolved options by name; dataclasses and mappings may nest.
+
+        Raises:
+            UserError: if it cannot be written.
         """
         record = {
             **{name: _plain(value) for name, value in options.items()},
@@ -134,8 +137,11 @@ class RunFolder:
         }
         text = yaml.safe_dump(record, sort_keys=False, allow_unicode=True)
         unfinished = self.config.with_suffix(".part")
-        unfinished.write_text(text, encoding="utf-8")
-        unfinished.replace(self.config)  # whoever finds a config finds a whole one
+        try:
+            unfinished.write_text(text, encoding="utf-8")
+            unfinished.replace(self.config)  # whoever finds a config finds a whole one
+        except OSError as error:
+            raise UserError(f"cannot write {self.config}: {error.strerror}; name another folder") from error
 
     def write_evaluation(self, returns: Float[Tensor, "learners episodes"]) -> None:
         """Write `evaluation.csv`: the return of every episode of the final evaluation."""

@@ -13,7 +13,7 @@ KERNELS = {"gaussian": SquaredExponential, "other": Matern}
 @pytest.mark.parametrize("options", [{}, {"projection": "dtc"}, {"order": "arrival"}, {"overshoot": 1}])
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_one_learner_learns_as_each_of_two_do(kernel: str, options: dict):
-    budget, points = (160, 700) if not options else (15, 200)
+    budget, points = (160, 700) if not options else (12, 170)
     alone, single, pair = (
         SparseOnlineGP(KERNELS[kernel](2, 0.3, 1.5, shape), budget, 0.02, 0.1, shape, **options)
         for shape in ((), (1,), (2,))

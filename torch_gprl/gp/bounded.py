@@ -118,7 +118,8 @@ class BoundedBasis(WhitenedState):
 
     def _prune(self, full: Tensor) -> None:
         """Delete the lowest scores of the learners that are `full` until they are back at their budget."""
-        chosen, used = full.reshape(-1).nonzero().squeeze(-1), slice(self._active().rows)
+        used = slice(int(self.size.max()))
+        chosen = slice(None) if bool(full.all()) else full.reshape(-1).nonzero().squeeze(-1)
         state = Whitened(
             self._flat("gram_factor")[chosen, used, used],
             self._flat("precision")[chosen, used, used],

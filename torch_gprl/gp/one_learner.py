@@ -92,14 +92,13 @@ def _add_most_novel(
     before = rows = len(phi)
     features = phi.new_empty(len(inputs), before + most)  # Φᵀ
     features[:, :before] = phi.mT
-    pivots: list[int] = []
+    covariance, pivots = _only(gp.kernel(inputs, inputs), 2), list[int]()
     while rows < before + most:
         excess, best = (novelty - threshold).max(0)
         if float(excess) <= 0:
             break
         pivot, known = int(best), features[:, :rows]
-        covariance = _only(gp.kernel(inputs[pivot : pivot + 1], inputs), 2)[0]
-        row = torch.addmv(covariance, known, known[pivot], alpha=-1)
+        row = torch.addmv(covariance[pivot], known, known[pivot], alpha=-1)
         features[:, rows] = row.mul_(row[pivot].rsqrt())
         novelty.addcmul_(row, row, value=-1)
         novelty[pivot] = 0.0  # nothing is missed of a basis vector

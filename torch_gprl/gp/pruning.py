@@ -50,7 +50,8 @@ def basis_statistics(
     half = torch.linalg.solve_triangular(precision_factor, inverse_factor, upper=False)
     weights = torch.cholesky_solve(state.information.unsqueeze(-1), precision_factor)
     alpha = (inverse_factor.mT @ weights).squeeze(-1)  # L⁻ᵀA⁻¹b
-    return BasisStatistics(alpha, inverse_factor.square().sum(-2), half.square().sum(-2), stamps, mask)
+    gram_inverse, posterior_precision = (torch.linalg.vecdot(x, x, dim=-2) for x in (inverse_factor, half))
+    return BasisStatistics(alpha, gram_inverse, posterior_precision, stamps, mask)
 
 
 @runtime_checkable
@@ -203,5 +204,6 @@ def _triangular(state: Whitened, order: Tensor, kept: int) -> Whitened:
         precision[..., touched] = precision[..., touched] @ rotation
     sign = torch.ones_like(state.information)
     sign[..., :kept] = joint.diagonal(dim1=-2, dim2=-1)[..., :kept].sign()
-    joint, precision = joint * sign.unsqueeze(-1), precision * sign.unsqueeze(-2)
-    return Whitened(joint[..., :kept, :kept].mT, precision * sign.unsqueeze(-1), joint[..., kept])
+    joint.mul_(sign.unsqueeze(-1))
+    precision.mul_(sign.unsqueeze(-2))
+    return Whitened(joint[..., :kept, :kept].mT, precision, joint[..., kept])

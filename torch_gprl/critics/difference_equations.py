@@ -75,7 +75,7 @@ class DifferenceEquations:
         rows = int(gp.size.max())
         self.basis, self.mask = gp.basis[..., :rows, :], gp.mask[..., None, :rows]
         self.cross = self.kernel(critic.inputs(transitions.observation, transitions.action), self.basis)
-        self.rate = discount * ~transitions.terminated
+        self.rate = discount * (~transitions.terminated).to(transitions.reward.dtype)
         self.targets = critic.standard_targets(transitions.reward.unsqueeze(-1), self.rate)
 
     @torch.no_grad()

@@ -75,14 +75,13 @@ def observe_anew(
         design: rows of X, one for each observation, for the first R basis vectors; zero where unused.
         targets: y.
     """
-    rows, noise = design.shape[-1], gp.noise_variance
-    factor = gp.gram_factor[..., :rows, :rows]
-    half = solve_triangular(factor, design.mT @ design)
+    rows, noise = design.shape[-1], gp.noise_variance.unsqueeze(-1)
+    # whitened before it is summed: L⁻¹(XᵀX)L⁻ᵀ would lose its digits where K is ill-conditioned
+    phi = solve_triangular(gp.gram_factor[..., :rows, :rows], design.mT)
     gp.forget()
-    gp.precision[..., :rows, :rows] += solve_triangular(factor, half.mT) / noise[..., None, None]  # L⁻¹XᵀXL⁻ᵀ
-    information = solve_triangular(factor, design.mT @ targets.unsqueeze(-1)).squeeze(-1)
-    gp.information[..., :rows] = information / noise.unsqueeze(-1)
-    count = targets.shape[-1]
+    gp.precision[..., :rows, :rows] += phi @ phi.mT / noise.unsqueeze(-1)
+    gp.information[..., :rows] = (phi @ targets.unsqueeze(-1)).squeeze(-1) / noise
+    count, noise = targets.shape[-1], gp.noise_variance
     quadratic = targets.square().sum(-1) / noise
     gp.evidence_constant.copy_(-0.5 * (quadratic + count * (2 * math.pi * noise).log()))
     gp.observations.fill_(count)

@@ -26,7 +26,8 @@ from torch_gprl.gp.prescribed import adopt_basis
 from torch_gprl.kernels import Matern
 from torch_gprl.learners.actor_critic_config import ActorCriticConfig
 from torch_gprl.learners.collecting import Collection
-from torch_gprl.policies import MLPController, gaussian_policy
+from torch_gprl.policies import ConfidenceNoise, MLPController, NoiseStream, ScaledController
+from torch_gprl.policies.gaussian import action_bounds
 
 REMEMBERED = (
     "observation",
@@ -62,16 +63,15 @@ class ActorCritic:
         indices = range(first_learner, first_learner + self.learners)
         spec = env.observation_spec["observation"]
         states, actions = spec.shape[-1], env.action_spec.shape[-1]
+        low, high = action_bounds(env.action_spec, actions)
         controller = MLPController(
             states, actions, (self.learners,), (config.hidden,) * 2, seed, first_learner
-        ).to(spec.dtype)
-        self.policy = gaussian_policy(controller, env.action_spec, config.std, seed, learners=indices)
-        self.policy.to(env.device).requires_grad_(False)
-        self.policy.head.controller.requires_grad_(True)
-        self.critic = self._make_critic(states, actions).to(env.device)
-        self.optimiser = torch.optim.Adam(
-            self.policy.head.controller.parameters(), config.learning_rate, betas=(0.9, 0.99)
         )
+        self.actor = ScaledController(controller, low, high).to(env.device, spec.dtype)
+        self.critic = self._make_critic(states, low, high).to(env.device)
+        noise = NoiseStream(seed, indices)
+        self.policy = ConfidenceNoise(self.actor, self.critic, config.confidence, noise)
+        self.optimiser = torch.optim.Adam(controller.parameters(), config.learning_rate, betas=(0.9, 0.99))
         self.collection = Collection(env, self.policy, config.rollout_steps)
         self.replay = TensorDictReplayBuffer(storage=LazyTensorStorage(config.total_frames))
         self.frames_per_update = num_envs * config.rollout_steps
@@ -79,14 +79,13 @@ class ActorCritic:
         self.updates = self.solved = self.renewed = 0
         self._last_return = torch.full((self.learners,), torch.nan, device=env.device)
 
-    def _make_critic(self, states: int, actions: int) -> GPActionValue:
+    def _make_critic(self, states: int, low: Tensor, high: Tensor) -> GPActionValue:
         """An empty critic, one Gaussian process for each learner."""
+        actions = len(low)
         lengthscale = torch.full((states + actions,), self.config.action_lengthscale, dtype=torch.float64)
         lengthscale[:states] = self.config.lengthscale * states**0.5
         kernel = Matern(states + actions, lengthscale, batch_shape=(self.learners,), smoothness=2.5)
         gp = SparseOnlineGP(kernel.requires_grad_(False), self.config.budget, overshoot=1)
-        head = self.policy.head
-        low, high = head.centre - head.half_range, head.centre + head.half_range
         return GPActionValue(gp, action_low=low.double(), action_high=high.double())
 
     @property
@@ -113,12 +112,12 @@ class ActorCritic:
             self._renew(data)
         self._scale_values(data)
         equations = DifferenceEquations(self.critic, data, self.config.discount)
-        head = self.policy.head
-        observation = data.next_observation.to(head.centre.dtype)
+        actor = self.actor
+        observation = data.next_observation.to(actor.centre.dtype)
         for sweep in range(self.config.sweeps):
             with torch.no_grad():
-                action = head.controller(observation).to(data.reward.dtype).clamp(-1, 1)
-            slopes = equations.solve(head.centre + head.half_range * action)
+                action = actor.controller(observation).to(data.reward.dtype).clamp(-1, 1)
+            slopes = equations.solve(actor.centre + actor.half_range * action)
             self._follow(observation, *self._step(action, slopes), offset=sweep)
         self.solved = len(self.replay)
 
@@ -129,12 +128,12 @@ class ActorCritic:
 
     def _renew(self, data: Transitions) -> None:
         """Scale inputs by all that was seen, actions by their range, and choose the basis among all."""
-        critic, head = self.critic, self.policy.head
+        critic, actor = self.critic, self.actor
         loc, std = data.observation.mean(1), data.observation.std(1)
         std = torch.where(std > 1e-6, std, 1.0)
-        critic.input_loc.copy_(torch.cat([loc, head.centre.expand(len(loc), -1)], -1))
-        critic.input_scale.copy_(torch.cat([std, head.half_range.expand(len(loc), -1)], -1))
-        head.controller.standardise(loc, std)
+        critic.input_loc.copy_(torch.cat([loc, actor.centre.expand(len(loc), -1)], -1))
+        critic.input_scale.copy_(torch.cat([std, actor.half_range.expand(len(loc), -1)], -1))
+        actor.controller.standardise(loc, std)
         adopt_basis(critic.gp, critic.inputs(data.observation, data.action))
         self.renewed = len(self.replay)
 
@@ -160,7 +159,7 @@ class ActorCritic:
 
     def _follow(self, observation: Tensor, target: Tensor, weight: Tensor, offset: int) -> None:
         """Fit the controller to the targets, on another subset of the states at each step."""
-        steps, controller = self.config.fit_steps, self.policy.head.controller
+        steps, controller = self.config.fit_steps, self.actor.controller
         target, weight = target.to(observation.dtype), weight.to(observation.dtype)
         stride = max(1, observation.shape[1] // self.config.batch)
         for step in range(steps):

@@ -1,10 +1,12 @@
 """The numbers of the actor-critic, each with its unit: they become the command line."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from torch_gprl.policies import ConfidenceScale
 
 LEAST_ONE = ("total_frames", "rollout_steps", "budget", "sweeps", "fit_steps", "batch", "hidden")
-POSITIVE = ("std", "amplitude", "noise", "lengthscale", "action_lengthscale", "trust_region", "learning_rate")
+POSITIVE = ("amplitude", "noise", "lengthscale", "action_lengthscale", "trust_region", "learning_rate")
 SHARES = ("discount", "growth")
 
 
@@ -18,7 +20,8 @@ class ActorCriticConfig:
     first_frames: int = 100  # environment steps per learner before it learns
     growth: float = 0.02  # share by which experience grows between two solutions
 
-    std: float = 0.6  # of the exploration's Gaussian noise, in halves of the actuator's range
+    # how far to explore where values are uncertain; a noise scale of 100 takes 0.05 deviations to 0.5
+    confidence: ConfidenceScale = field(default_factory=lambda: ConfidenceScale(100.0, 0.1, 0.6))
 
     sweeps: int = 4  # solutions of the critic in a row, each followed by a step of the policy
     trust_region: float = 0.5  # root mean square of a step of the policy, in halves of the actuator's range

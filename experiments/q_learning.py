@@ -45,8 +45,15 @@ class Options:
 class Learner(Protocol):
     """What every arm is."""
 
-    frames: int
-    policy: TensorDictModuleBase
+    @property
+    def frames(self) -> int:
+        """Environment steps per learner so far."""
+        ...
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """What it would do now."""
+        ...
 
     def train(self) -> Iterator[object]:
         """Stops now and then."""

@@ -32,7 +32,7 @@ class Options:
 
     processes: int = 2  # that share out the points
     budgets: tuple[int, ...] = (50, 200, 800)  # basis vectors
-    points: int = 256  # of each process in each update
+    points: int = 2000  # of each process in each update: a rollout of ten environments
     seconds: float = 3.0  # of updates, for each figure
     out: Path | None = None  # JSON file
 
@@ -41,7 +41,8 @@ class Options:
 class Cost:
     """Of one process, in updates of `points` each."""
 
-    updates_per_second: float
+    updates_per_second: float  # by the clock
+    cpu_ms: float  # of processor time for each update, which a busy machine does not stretch
     exchange_share: float  # of the time, in the all-reduce of a message of this size
     basis: int  # vectors in use
     bytes: int  # of the all-reduce, for each update and learner
@@ -65,7 +66,7 @@ def measure(rank: int, options: Options, budget: int) -> Cost:
     blocks = [stream(1000 + 10 * rank + block, options.points) for block in range(10)]
     # what has been learned so often is not novel: from here on the basis stays
     gp.novelty_threshold = 1e9
-    seconds, updates = 0.0, 0
+    seconds, updates, busy = 0.0, 0, time.process_time()
     while seconds < options.seconds:  # every process takes the same decision: rank 0's clock counts
         begin = time.perf_counter()
         for block in blocks:
@@ -76,10 +77,11 @@ def measure(rank: int, options: Options, budget: int) -> Cost:
             clock = torch.tensor(seconds)
             dist.broadcast(clock, 0)
             seconds = float(clock)
+    cpu_ms = 1000 * (time.process_time() - busy) / updates
     rows = int(gp.size)
     message = torch.zeros(rows * (rows + 1) // 2 + rows + 2, dtype=torch.float64)
     share = exchange(message) * updates / seconds
-    return Cost(updates / seconds, share, rows, 0 if alone else message.nbytes)
+    return Cost(updates / seconds, cpu_ms, share, rows, 0 if alone else message.nbytes)
 
 
 def exchange(message: Tensor, repeats: int = 50) -> float:
@@ -125,11 +127,13 @@ def main(options: Options) -> None:
         single = run(Options(1, points=options.points, seconds=options.seconds), budget)
         shared = run(options, budget)
         speedup = options.processes * shared.updates_per_second / single.updates_per_second
-        rows.append({"budget": budget, "alone": asdict(single), "shared": asdict(shared), "speedup": speedup})
+        bound = options.processes * single.cpu_ms / shared.cpu_ms  # if every process had a core of its own
+        found = {"speedup": speedup, "speedup_bound": bound}
+        rows.append({"budget": budget, "alone": asdict(single), "shared": asdict(shared), **found})
         print(
-            f"{single.basis} basis vectors: {options.points * single.updates_per_second:,.0f} points/s alone, "
-            f"{speedup:.2f} times that with {options.processes} processes; {shared.bytes:,} bytes an update, "
-            f"{shared.exchange_share:.0%} of the time"
+            f"{single.basis} vectors: {options.points} points take {single.cpu_ms:.2f} ms of a processor, "
+            f"{shared.cpu_ms:.2f} with {options.processes} processes that exchange {shared.bytes:,} bytes; "
+            f"speed {speedup:.2f} times that of one, at most {bound:.2f}"
         )
     if options.out:
         found = machine() | {"points": options.points, "processes": options.processes, "results": rows}

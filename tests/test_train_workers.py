@@ -37,12 +37,10 @@ def test_a_missing_ray_is_the_users_to_mend(monkeypatch, capsys, tmp_path):
 def test_workers_leave_a_whole_run(collector, algorithm, tmp_path):
     if collector == "ray":
         pytest.importorskip("ray", reason="needs the extra ray")
-    arguments = (
-        f"{algorithm} --collector {collector} --learners 2 --num-envs 2 --total-frames 800 --budget 20"
-    )
-    command = [sys.executable, "train.py", *arguments.split(), "--out", str(tmp_path / "run")]
+    size = "--learners 2 --num-envs 2 --total-frames 800 --budget 20 --evaluation-episodes 1"
+    arguments = [algorithm, "--collector", collector, "--workers", "2", *size.split()]
     done = subprocess.run(
-        [*command, "--evaluation-episodes", "1"],
+        [sys.executable, "train.py", *arguments, "--out", str(tmp_path / "run")],
         cwd=ROOT,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         capture_output=True,

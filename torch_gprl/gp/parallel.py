@@ -8,8 +8,6 @@ m²/2 + m numbers for m basis vectors, besides novel points, of which all proces
 The processes are those of `torch.distributed`: gloo on CPUs, NCCL on GPUs.
 """
 
-from typing import Any
-
 import torch
 import torch.distributed as dist
 from jaxtyping import Bool, Float, Int
@@ -28,7 +26,7 @@ class ParallelSparseGP(SparseOnlineGP):
 
     Made with the same arguments everywhere, after `init_process_group`; `broadcast_state` makes replicas
     equal that are not. All of them call `update` together, each with its own data, which equals one update
-    with all data at once. Everything else is read locally.
+    with all data at once, and is one exchange, however many points it has. Everything else is read locally.
 
     Replicas stay equal where processes compute alike: on machines of one kind.
 
@@ -64,39 +62,42 @@ class ParallelSparseGP(SparseOnlineGP):
             ValueError: numbers of points differ between processes, or any process has data that
                 `SparseOnlineGP` refuses; nothing was changed then, in any of them.
         """
-        options: dict[str, Any] = {"next_inputs": next_inputs, "discount": discount}
-        refusal = self._refusal(inputs, targets, mask, **options)
-        points = inputs.shape[-2] if refusal is None else 0
-        extremes = torch.tensor([points, -points, refusal is not None], device=self.size.device)
+        observed = self._admitted(inputs, targets, mask, next_inputs, discount)
+        refused = isinstance(observed, ValueError)
+        points = 0 if refused else observed.inputs.shape[-2]
+        extremes = torch.tensor([points, -points, refused], device=self.size.device)
         dist.all_reduce(extremes, op=dist.ReduceOp.MAX)  # or the others would wait for this one for ever
-        most, least, refused = extremes.tolist()
+        most, least, any_refused = extremes.tolist()
         if refused:
-            raise refusal or ValueError("another process has data that it refuses; its error tells which")
+            raise observed
+        if any_refused:
+            raise ValueError("another process has data that it refuses; its error tells which")
         if most != -least:
             raise ValueError(
                 f"every process must bring as many points, got {-least} to {most}; fill up the shorter ones "
                 "and leave that out by mask="
             )
-        super().update(inputs, targets, stamp, mask, **options)
+        if stamp is not None:
+            self.clock.fill_(stamp)
+        if self._kernel_versions() != self._kernel_seen:
+            self.rebase()
+        if most:
+            self._absorb_block(observed, self.noise_variance.unsqueeze(-1))
 
-    def _refusal(
+    def _admitted(
         self,
         inputs: Tensor,
         targets: Tensor,
         mask: Tensor | None,
-        next_inputs: Any,  # noqa: ANN401
-        discount: Any,  # noqa: ANN401
-    ) -> ValueError | None:
-        """Why this process' data cannot be learned, if they cannot."""
+        next_inputs: Tensor | GaussianInputs | None,
+        discount: float | Tensor,
+    ) -> Observed | ValueError:
+        """This process' data, or why they cannot be learned."""
         try:
             admitted = admit_data(inputs, targets, mask, self.batch_shape, self.basis)
-            self._observed(*admitted, next_inputs, discount)
+            return self._observed(*admitted, next_inputs, discount)
         except ValueError as error:
             return error
-        return None
-
-    def _is_alone(self) -> bool:
-        return False
 
     def _absorb_block(self, block: Observed, noise: Tensor) -> None:
         points = self._points_of_all(block)

@@ -34,7 +34,7 @@ class QLearningConfig(Behaviour):
     candidates: int = 25  # actions compared in a maximisation
     optimism: float = 0.0  # what is not known is this many deviations of the value above its mean; fitted
 
-    budget: int = 200  # basis vectors of the critic
+    budget: int = 350  # basis vectors of the critic; too few, and what was solved is lost again
     novelty_threshold: float = 0.3  # novelty that makes a point a basis vector, in noise variances
     noise: float = 1e-3  # noise variance of targets, in their variances
     kernel: StateKernel = "matern"  # over states; Matérn 5/2 follows the ridges of values

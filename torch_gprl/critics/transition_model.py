@@ -1,12 +1,12 @@
 """What a step leads to, learned: next observation and reward as Gaussian processes of observation and action.
 
-Differences of observations and rewards are functions of the same inputs under one kernel, a squared
-exponential for the bends plus a linear kernel for what mechanics makes of small steps (Deisenroth, Fox and
-Rasmussen, 2015, learn the same differences). Inputs and targets are standardised by the data.
+Differences of observations, and rewards, have as their prior a squared exponential for the bends plus a
+linear kernel for what mechanics makes of small steps (Deisenroth, Fox and Rasmussen, 2015, learn the same
+differences). Inputs and targets are standardised by the data.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -54,41 +54,31 @@ class Prediction(NamedTuple):
     doubt: Tensor
 
 
-class TransitionModel:
-    """Predicts steps, for each learner from its own experience.
+class Regressor:
+    """Standardised targets as functions of the same inputs: kernel, noise, and what the data say.
 
     Args:
         learners: L, how many.
-        states: S, size of an observation.
-        actions: A, size of an action.
+        columns: D, of the inputs.
         budget: basis vectors.
     """
 
-    def __init__(self, learners: int, states: int, actions: int, budget: int) -> None:
+    def __init__(self, learners: int, columns: int, budget: int) -> None:
+        batch = (learners,)
         self.budget = budget
-        columns, batch = states + actions, (learners,)
-        bends = SquaredExponential(columns, 2.0, batch_shape=batch)
-        bends.set_prior("lengthscale", LogNormal(math.log(2.0), 1.0))
-        bends.set_prior("outputscale", LogNormal(0.0, 2.0))
+        self.bends = SquaredExponential(columns, 2.0, batch_shape=batch)
+        self.bends.set_prior("lengthscale", LogNormal(math.log(2.0), 1.0))
+        self.bends.set_prior("outputscale", LogNormal(0.0, 2.0))
         slopes = Linear(columns, 0.4, 0.4, batch_shape=batch)
         slopes.set_prior("slope_variance", LogNormal(-1.0, 2.0))
         slopes.set_prior("bias_variance", LogNormal(-1.0, 2.0))
-        self.bends = bends
-        self.kernel: Kernel = bends + slopes
+        self.kernel: Kernel = self.bends + slopes
         self.log_noise = torch.full(batch, math.log(FIRST_NOISE), dtype=torch.float64)
 
-    def solve(self, data: Transitions, fit: bool) -> None:
-        """Learn all experience anew, with new hyper-parameters if asked."""
-        seen = torch.cat([data.observation, data.following], 1)
-        self.loc, self.scale = _moments(data.observation)
-        low, high = seen.amin(1, keepdim=True), seen.amax(1, keepdim=True)
-        self._low, self._high = low - MARGIN * (high - low), high + MARGIN * (high - low)
-        self._reward_low, self._reward_high = data.reward.amin(1, True), data.reward.amax(1, True)
-        change = data.following - data.observation
-        targets = torch.cat([change, data.reward.unsqueeze(-1)], -1)
-        self._target_loc, self._target_scale = _moments(targets)
+    def solve(self, inputs: Float[Tensor, "L N D"], targets: Float[Tensor, "L N T"], fit: bool) -> None:
+        """Learn all data anew, with new hyper-parameters if asked."""
+        self._target_loc, self._target_scale = moments(targets)
         targets = (targets - self._target_loc) / self._target_scale
-        inputs = self.inputs(data.observation, data.action)
         if fit:
             spaced = torch.linspace(0, inputs.shape[1] - 1, min(FIT_POINTS, inputs.shape[1])).long()
             self._fit(inputs[:, spaced], targets[:, spaced])
@@ -97,34 +87,21 @@ class TransitionModel:
         basis = inputs.take_along_dim(chosen.unsqueeze(-1), 1)
         self._regression = SparseRegression(self.kernel, basis, inputs, targets, self.log_noise.exp())
 
-    def inputs(self, observation: Tensor, action: Tensor) -> Float[Tensor, "L N D"]:
-        """Standardised observations beside actions."""
-        return torch.cat([(observation - self.loc) / self.scale, action], -1)
+    def mean(self, inputs: Float[Tensor, "L N D"]) -> Float[Tensor, "L N T"]:
+        """Expected targets."""
+        return self._regression.mean(inputs) * self._target_scale + self._target_loc
 
-    @torch.no_grad()
-    def predict(self, observation: Tensor, action: Tensor, doubt: bool = True) -> Prediction:
-        """What steps lead to, within the range of what was seen.
-
-        Args:
-            observation: [L, N, S].
-            action: [L, N, A], in halves of the actuator's range.
-            doubt: whether doubt is computed, at several times the cost; else it is zero.
-        """
-        inputs = self.inputs(observation, action)
-        mean = self._regression.mean(inputs) * self._target_scale + self._target_loc
-        following = torch.clamp(observation + mean[..., :-1], self._low, self._high)
-        reward = torch.clamp(mean[..., -1], self._reward_low, self._reward_high)
-        if not doubt:
-            return Prediction(following, reward, torch.zeros_like(reward))
-        left = self._regression.variance(inputs) / self.bends.outputscale.unsqueeze(-1)
-        return Prediction(following, reward, left.clamp(max=1.0))
+    def doubt(self, inputs: Float[Tensor, "L N D"]) -> Float[Tensor, "L N"]:
+        """The share, 0 to 1, of the prior variance of the bends that data have not removed."""
+        left = self._regression.variance(inputs) / self.bends.outputscale.detach().unsqueeze(-1)
+        return left.clamp(max=1.0)
 
     def _fit(self, inputs: Tensor, targets: Tensor) -> None:
         """Maximise the evidence of all targets together, from where the last fit ended."""
-        parameters = list(self.kernel.parameters())
-        before = [value.detach().clone() for value in (*parameters, self.log_noise)]
+        parameters = [*self.kernel.parameters(), self.log_noise]
+        before = [value.detach().clone() for value in parameters]
         self.log_noise.requires_grad_(True)
-        optimiser = torch.optim.Adam([*parameters, self.log_noise], lr=0.1)
+        optimiser = torch.optim.Adam(parameters, lr=0.1)
         try:
             for _ in range(FIT_STEPS):
                 optimiser.zero_grad()
@@ -134,7 +111,7 @@ class TransitionModel:
             self._log_evidence(inputs, targets)  # the last step may have gone too far
         except CholeskyError:
             with torch.no_grad():
-                for value, old in zip((*parameters, self.log_noise), before, strict=True):
+                for value, old in zip(parameters, before, strict=True):
                     value.copy_(old)
         self.log_noise.requires_grad_(False)
 
@@ -147,17 +124,75 @@ class TransitionModel:
         misfit = 0.5 * white.square().sum((-2, -1)) + targets.shape[-1] * volume
         return self.kernel.log_prior() - misfit - 0.125 * (self.log_noise - math.log(FIRST_NOISE)).square()
 
-    def state_dict(self) -> dict[str, dict[str, Tensor] | Tensor]:
-        """The hyper-parameters; the rest follows from the experience."""
+    def state_dict(self) -> dict[str, Any]:
+        """The hyper-parameters; the rest follows from the data."""
         return {"kernel": self.kernel.state_dict(), "log_noise": self.log_noise.clone()}
 
-    def load_state_dict(self, state: dict) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what `state_dict` gave."""
         self.kernel.load_state_dict(state["kernel"])
         self.log_noise.copy_(state["log_noise"])
 
 
-def _moments(values: Tensor) -> tuple[Tensor, Tensor]:
+class TransitionModel:
+    """Predicts steps, for each learner from its own experience.
+
+    Differences of observations share one regressor; the reward, which may jump where mechanics is smooth,
+    has its own.
+
+    Args:
+        learners: L, how many.
+        states: S, size of an observation.
+        actions: A, size of an action.
+        budget: basis vectors of each regressor.
+    """
+
+    def __init__(self, learners: int, states: int, actions: int, budget: int) -> None:
+        self.budget = budget
+        self.motion = Regressor(learners, states + actions, budget)
+        self.reward = Regressor(learners, states + actions, budget)
+
+    def solve(self, data: Transitions, fit: bool) -> None:
+        """Learn all experience anew, with new hyper-parameters if asked."""
+        seen = torch.cat([data.observation, data.following], 1)
+        self.loc, self.scale = moments(data.observation)
+        low, high = seen.amin(1, keepdim=True), seen.amax(1, keepdim=True)
+        self._low, self._high = low - MARGIN * (high - low), high + MARGIN * (high - low)
+        self._reward_low, self._reward_high = data.reward.amin(1, True), data.reward.amax(1, True)
+        inputs = self.inputs(data.observation, data.action)
+        self.motion.solve(inputs, data.following - data.observation, fit)
+        self.reward.solve(inputs, data.reward.unsqueeze(-1), fit)
+
+    def inputs(self, observation: Tensor, action: Tensor) -> Float[Tensor, "L N D"]:
+        """Standardised observations beside actions."""
+        return torch.cat([(observation - self.loc) / self.scale, action], -1)
+
+    @torch.no_grad()
+    def predict(self, observation: Tensor, action: Tensor, doubt: bool = True) -> Prediction:
+        """What steps lead to, within the range of what was seen.
+
+        Args:
+            observation: [L, N, S].
+            action: [L, N, A], in halves of the actuator's range.
+            doubt: whether doubt about the motion is computed, at several times the cost; else it is zero.
+        """
+        inputs = self.inputs(observation, action)
+        following = torch.clamp(observation + self.motion.mean(inputs), self._low, self._high)
+        reward = torch.clamp(self.reward.mean(inputs).squeeze(-1), self._reward_low, self._reward_high)
+        unsure = self.motion.doubt(inputs) if doubt else torch.zeros_like(reward)
+        return Prediction(following, reward, unsure)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The hyper-parameters; the rest follows from the experience."""
+        return {"motion": self.motion.state_dict(), "reward": self.reward.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what `state_dict` gave."""
+        self.motion.load_state_dict(state["motion"])
+        self.reward.load_state_dict(state["reward"])
+
+
+def moments(values: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation over the data [L, 1, columns]; 1 for a column that never changes."""
     std = values.std(1, keepdim=True)
     return values.mean(1, keepdim=True), torch.where(std > 1e-9, std, 1.0)

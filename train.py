@@ -29,7 +29,7 @@ import tyro
 from torchrl import logger as torchrl_logger
 
 import envs
-from torch_gprl.critics import GPActionValue
+from torch_gprl.critics import GPActionValue, graph_edges
 from torch_gprl.learners import (
     ActorCritic,
     ActorCriticConfig,
@@ -63,6 +63,7 @@ from torch_gprl.runs import (
     mistakes_of_the_user,
     read_metrics,
     save_figure,
+    save_graph,
     summary,
     value_on_plane,
     value_surface,
@@ -303,8 +304,7 @@ def collecting(learner: Learner, options: RunOptions) -> Iterator[None]:
 
 def conclude(learner: Learner, options: RunOptions, folder: RunFolder) -> None:
     """Evaluate what was learned, draw it, and put it all on one page."""
-    env = make_env(options, options.evaluation_episodes, EVALUATION_SEED)
-    returns = evaluate(env, learner.policy)
+    returns = evaluate(make_env(options, options.evaluation_episodes, EVALUATION_SEED), learner.policy)
     folder.write_evaluation(returns)
     print(summary(returns), flush=True)
     draw(learner, options, folder, best=int(returns.mean(dim=1).argmax()))
@@ -322,6 +322,7 @@ def draw(learner: Learner, options: RunOptions, folder: RunFolder, best: int) ->
     if env.plane is not None and isinstance(critic, GPActionValue):
         surface = value_on_plane(critic, learner.policy, env.plane, best)
         save_figure(value_surface(surface, title), folder.figures / "value_surface.png")
+        save_graph(graph_edges(critic, best), surface, env.plane, folder.figures / "graph.png", title)
     if isinstance(critic, GPActionValue):
         starts = make_env(options, JUDGED_EPISODES, EVALUATION_SEED)
         foresight = foresee(starts, learner.policy, critic, learner.config.discount, best)
@@ -358,8 +359,7 @@ def plot(options: PlotOptions) -> None:
     """Draw the learning curves of several runs into one picture."""
     if not options.folders:
         raise UserError("plot needs the folder of a run, or of several")
-    curves = {}
-    names = [path.name for path in options.folders]
+    curves, names = {}, [path.name for path in options.folders]
     for path in options.folders:
         recorded = read_metrics(RunFolder.opened(path).metrics)
         if options.metric not in recorded:

@@ -12,6 +12,7 @@ from torch_gprl.critics import (
     action_value_kernel,
     clear_graphs,
     follow_basis,
+    graph_edges,
     graphs,
     store_transitions,
 )
@@ -115,3 +116,22 @@ def test_a_saved_critic_brings_its_graph_along():
         strict=True,
     ):
         torch.testing.assert_close(found, expected)
+
+
+def test_edges_are_those_of_neighbours_or_of_visited_steps():
+    data = transitions()
+    critic = made("geodesic")
+    critic.standardise(data["observation"], data["action"], data["value_target"])
+    store_transitions(critic, data)
+    (edges,) = graph_edges(critic, 1)
+    steps = torch.stack([data["observation"][1], data["next", "observation"][1]], -2)
+    expected = steps[:, :-1].flatten(0, 1)  # what follows the last step was not visited
+    torch.testing.assert_close(edges, expected)
+    critic = made("shortest-path")
+    critic.update(data)
+    follow_basis(critic)
+    (edges,) = graph_edges(critic, 0)
+    (graph,) = graphs(critic)
+    assert isinstance(graph, TransitionGraph)
+    assert len(edges) == graph.degrees()[0].sum() / 2
+    assert list(graph_edges(made("matern-1/2"), 0)) == []

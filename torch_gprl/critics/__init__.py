@@ -9,6 +9,7 @@ from torch_gprl.critics.kernels_by_name import (
     action_value_kernel,
     clear_graphs,
     follow_basis,
+    graph_edges,
     graphs,
     store_transitions,
 )
@@ -34,6 +35,7 @@ __all__ = [
     "clipped_moments",
     "correlation",
     "follow_basis",
+    "graph_edges",
     "graphs",
     "interval_coverage",
     "k_step_returns",

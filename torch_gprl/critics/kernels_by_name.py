@@ -122,6 +122,20 @@ def graphs(critic: GPActionValue) -> Iterator[TransitionGraph | Experience]:
             yield module
 
 
+def graph_edges(critic: GPActionValue, learner: int) -> Iterator[Float[Tensor, "edges 2 S"]]:
+    """Both ends of the edges of each graph of one learner, as observations: visited steps, or neighbours."""
+    for graph in graphs(critic):
+        if isinstance(graph, TransitionGraph):
+            points, ends = graph.points[learner], graph.lengths[learner].isfinite().triu(1).nonzero()
+        else:
+            points, used = graph.states[learner], slice(int(graph.size))
+            goes_on = ~(graph.ends | graph.terminated)[learner, used]
+            first = goes_on.nonzero().squeeze(-1)
+            ends = torch.stack([first, graph.after_nodes[learner, first, 0]], -1)
+        dims = points.shape[-1]
+        yield points[ends] * critic.input_scale[learner, :dims] + critic.input_loc[learner, :dims]
+
+
 @torch.no_grad()
 def store_transitions(critic: GPActionValue, transitions: TensorDictBase) -> None:
     """Store transitions in the graph of visited states; nothing under a kernel without one.

@@ -12,7 +12,7 @@ from torch_gprl.runs.failures import RunFailure, failures_of
 from torch_gprl.runs.figures import Surface, compare_curves, learning_curve, save_figure, value_surface
 from torch_gprl.runs.folder import RunFolder
 from torch_gprl.runs.foresight import foresee, foresight_figure
-from torch_gprl.runs.graph_figure import graph_figure
+from torch_gprl.runs.graph_figure import graph_figure, save_graph
 from torch_gprl.runs.intervals import bootstrap_interval
 from torch_gprl.runs.metrics import MetricsWriter, read_metrics
 from torch_gprl.runs.progress import Progress
@@ -47,6 +47,7 @@ __all__ = [
     "mistakes_of_the_user",
     "read_metrics",
     "save_figure",
+    "save_graph",
     "summary",
     "value_on_plane",
     "value_surface",

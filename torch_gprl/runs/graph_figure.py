@@ -1,11 +1,16 @@
 """The graph that a critic's kernel stands on, drawn over the value function (the thesis' Fig. .3)."""
 
+from collections.abc import Iterable
+from pathlib import Path
+
 import numpy as np
 from jaxtyping import Float
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from torch import Tensor
 
-from torch_gprl.runs.figures import Surface
+from torch_gprl.runs.figures import Surface, save_figure
+from torch_gprl.runs.surfaces import PicturePlane
 
 LONGEST = 0.5  # of the picture's width or height: a longer edge goes round the back, where the plane is cut
 
@@ -29,3 +34,24 @@ def graph_figure(surface: Surface, edges: Float[np.ndarray, "edges 2 2"], title:
     axes.set(xlabel=surface.labels[0], ylabel=surface.labels[1], title=title)
     axes.set(xlim=surface.x[[0, -1]], ylim=surface.y[[0, -1]])
     return figure
+
+
+def save_graph(
+    graphs: Iterable[Float[Tensor, "edges 2 S"]],
+    surface: Surface,
+    plane: PicturePlane,
+    path: Path,
+    title: str,
+) -> None:
+    """Draw a critic's graph, if it has one.
+
+    Args:
+        graphs: both ends of the edges of one graph, as observations, or nothing.
+        surface: the values over the plane.
+        plane: where observations lie.
+        path: of the picture.
+        title: e.g. the task.
+    """
+    for edges in graphs:
+        places = plane.from_observation(edges).double().cpu().numpy()
+        save_figure(graph_figure(surface, places, title), path)

@@ -21,6 +21,7 @@ from tensordict.nn import TensorDictModuleBase
 import envs
 from benchmarks.env_steps import gymnasium_id
 from torch_gprl import learners
+from torch_gprl.policies import ConfidenceScale
 
 
 @dataclass(frozen=True)
@@ -204,11 +205,18 @@ ARMS = {
     "SAC small": peer("SAC", {}, SMALL_SAC),
 }
 MAIN = tuple(ARMS)
-# what each part of Q-learning brings: run by name
+# what each part brings: run by name
+CEILING = ConfidenceScale(noise_scale=1e6, floor=0.6, ceiling=0.6)
 ARMS |= {
     "q-learning, online": ours("QLearning", targets="online"),
     "q-learning, squared exponential": ours("QLearning", kernel="squared-exponential"),
     "q-learning, half the noise": ours("QLearning", std=0.3),
     "q-learning, optimistic": ours("QLearning", optimism=1.0),
     "q-learning, pessimistic": ours("QLearning", optimism=-1.0),
+    "actor-critic, same noise everywhere": ours("ActorCritic", confidence=CEILING),
+    "actor-critic, one sweep": ours("ActorCritic", sweeps=1),
+    "actor-critic, steps of any length": ours("ActorCritic", trust_region=10.0),
+    "actor-critic, short steps": ours("ActorCritic", trust_region=0.1),
+    "actor-critic, solved at every look": ours("ActorCritic", growth=0.0),
+    "actor-critic, less noise of rewards": ours("ActorCritic", noise=1e-5),
 }

@@ -68,6 +68,7 @@ def test_arms_start_alike():
     assert STARTS > 0
 
 
+@pytest.mark.slow
 def test_finished_arms_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(exploration, "QUICK_SHARE", 60)
     arms = ("gaussian 0.3", "confidence", "matched")

@@ -25,8 +25,8 @@ class ParallelSparseGP(SparseOnlineGP):
     """A sparse process with a replica in each of `torch.distributed`'s processes; see `SparseOnlineGP`.
 
     Made with the same arguments everywhere, after `init_process_group`; `broadcast_state` makes replicas
-    equal that are not. All of them call `update` together, each with its own data, which equals one update
-    with all data at once, and is one exchange, however many points it has. Everything else is read locally.
+    equal that are not. All of them call `update` together, each with its own data: one exchange, however many
+    points, which equals an update of one process by all data as a single block. Everything else is local.
 
     Replicas stay equal where processes compute alike: on machines of one kind.
 

@@ -86,7 +86,8 @@ class GibbsHead(ActionHead):
         self.register_buffer("inverse_temperature", low.new_tensor(config.inverse_temperature))
         # the grid in one dimension; in more an even cover, the same for all states, that gives Q̃ its range
         self.cover = ActionMaximiser(critic, low, high, candidates=config.points)
-        self.proposal = Proposal(low, high, config.points) if len(low) > 1 else None
+        even = config.points + config.points % 2  # candidates come in two halves
+        self.proposal = Proposal(low, high, even) if len(low) > 1 else None
 
     @property
     def random_numbers(self) -> int:

@@ -43,7 +43,7 @@ class Snapshots:
             width = (learner.maximiser.high - learner.maximiser.low).item() / 2
             self.taken.setdefault("sigma", []).append(std[0, :, 0].reshape(GRID, GRID).float() / width)
             self.taken.setdefault("frames", []).append(learner.frames)
-        elif isinstance(explorer, GibbsPolicy):
+        elif isinstance(explorer, GibbsPolicy) and learner.frames <= self.setting.frames / 2:
             self.taken["figure 2"] = self._value_and_density(learner, explorer)
 
     def _plane(self) -> Tensor:
@@ -72,12 +72,12 @@ class Snapshots:
         shares = torch.stack(
             [density.log_prob(action.expand(*states.shape[:2], 1)).exp()[0] for action in grid], -1
         )
-        many = self._everyone(learner, points[torch.randint(GRID, (SAMPLES,))])
+        low, high = self.setting.low[0], self.setting.high[0]
+        anywhere = torch.stack([low + (high - low) * torch.rand(SAMPLES), torch.zeros(SAMPLES)], -1)
+        many = self._everyone(learner, anywhere)
         drawn = explorer.get_dist(TensorDict({"observation": many}, many.shape[:2])).sample()[0, :, 0]
         angle = self.setting.place(many[0])[:, 0]
-        value = learner.maximiser.critic.mean_value(
-            states.unsqueeze(2).expand(-1, -1, len(grid), -1), grid.expand(*states.shape[:2], -1, -1)
-        )[0]
+        value = explorer.head.opinion(states, explorer.head.mean_at(states), states[..., :0])["preference"][0]
         return {
             "first": first,
             "action": grid[:, 0],
@@ -91,13 +91,14 @@ def draw(
     setting: Setting, outcomes: dict[str, Outcome], pictures: dict[str, dict[str, Any]], out: Path
 ) -> None:
     """All pictures of a task, as far as arms are done."""
-    draw_curves(setting, outcomes, out / f"{setting.task} curves.png")
-    draw_visits(setting, outcomes, out / f"{setting.task} visits.png")
+    draw_curves(setting, outcomes, out / f"{setting.task}-curves.png")
+    draw_visits(setting, outcomes, out / f"{setting.task}-visits.png")
     for arm, taken in pictures.items():
+        name = f"{setting.task}-{arm.replace(' ', '-')}"
         if "sigma" in taken:
-            draw_sigma(setting, taken, out / f"{setting.task} sigma.png")
+            draw_sigma(setting, taken, out / f"{name}-sigma.png")
         if "figure 2" in taken:
-            draw_density(setting, taken["figure 2"], arm, out / f"{setting.task} {arm} density.png")
+            draw_density(setting, taken["figure 2"], arm, out / f"{name}-density.png")
 
 
 def draw_curves(setting: Setting, outcomes: dict[str, Outcome], path: Path) -> None:
@@ -121,7 +122,10 @@ def draw_visits(setting: Setting, outcomes: dict[str, Outcome], path: Path) -> N
     columns = 4
     rows = -(-len(outcomes) // columns)
     figure = Figure(figsize=(3 * columns, 2.6 * rows), layout="constrained")
-    for axes, (arm, outcome) in zip(np.ravel(figure.subplots(rows, columns)), outcomes.items(), strict=False):
+    panels = np.ravel(figure.subplots(rows, columns))
+    for axes in panels[len(outcomes) :]:
+        axes.set_axis_off()
+    for axes, (arm, outcome) in zip(panels, outcomes.items(), strict=False):
         points = outcome.states.flatten(0, 1).numpy()
         counts, _, _ = np.histogram2d(points[:, 0], points[:, 1], bins=CELLS, range=((0, 1), (0, 1)))
         _map(axes, setting, np.log1p(counts))
@@ -146,11 +150,15 @@ def draw_sigma(setting: Setting, taken: dict[str, Any], path: Path) -> None:
 
 
 def draw_density(setting: Setting, taken: dict[str, Tensor], arm: str, path: Path) -> None:
-    """Fig. .2: value and selection density side by side, with samples overlaid."""
+    """Fig. .2: value and selection density side by side, with samples overlaid.
+
+    The value is scaled by its range over the actions of each state, the density by its peak there.
+    """
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     x, y = taken["first"].numpy(), taken["action"].numpy()
     for axes, name in zip(figure.subplots(1, 2), ("value", "density"), strict=True):
-        image = axes.pcolormesh(x, y, taken[name].mT.numpy(), shading="nearest")
+        relative = taken[name] / taken[name].amax(1, keepdim=True)
+        image = axes.pcolormesh(x, y, relative.mT.numpy(), shading="nearest")
         figure.colorbar(image, ax=axes)
         axes.plot(*taken["samples"].mT.numpy(), ".", color="white", markersize=1.5)
         axes.set(xlabel=setting.labels[0], ylabel="action", title=f"{arm}: {name}")

@@ -78,7 +78,7 @@ def test_finished_arms_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     first = json.loads(results.read_text(encoding="utf-8"))["pendulum-explore"]
     assert first["tuned"] == "gaussian 0.3"
     assert set(first["arms"]) == set(arms)
-    assert (tmp_path / "quick" / "pendulum-explore visits.png").exists()
+    assert (tmp_path / "quick" / "pendulum-explore-visits.png").exists()
     monkeypatch.setattr(exploration, "run", None)  # nothing is left to run
     main(options)
     assert json.loads(results.read_text(encoding="utf-8"))["pendulum-explore"] == first

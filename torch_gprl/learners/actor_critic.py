@@ -37,7 +37,6 @@ REMEMBERED = (
     ("next", "terminated"),
 )
 RENEWAL = 1.2  # growth of experience between renewals of scaling and basis
-LEAST_NOISE = 1e-6  # noise variance, in prior variances of the value
 
 
 class ActorCritic:
@@ -85,7 +84,9 @@ class ActorCritic:
         lengthscale = torch.full((states + actions,), self.config.action_lengthscale, dtype=torch.float64)
         lengthscale[:states] = self.config.lengthscale * states**0.5
         kernel = Matern(states + actions, lengthscale, batch_shape=(self.learners,), smoothness=2.5)
-        gp = SparseOnlineGP(kernel.requires_grad_(False), self.config.budget, overshoot=1)
+        # in prior variances of the value, which `_scale_values` ties to those of the reward
+        noise = self.config.noise * ((1 - self.config.discount) / self.config.amplitude) ** 2
+        gp = SparseOnlineGP(kernel.requires_grad_(False), self.config.budget, noise, overshoot=1)
         return GPActionValue(gp, action_low=low.double(), action_high=high.double())
 
     @property
@@ -100,10 +101,10 @@ class ActorCritic:
             experience = rollout.select(*REMEMBERED).reshape(self.learners, -1)
             self.replay.extend(experience.transpose(0, 1))
             self.updates += 1
-            seen = len(self.replay)
+            seen, error = len(self.replay), self._surprise(rollout)
             if seen >= self.config.first_frames and seen >= self.solved * (1 + self.config.growth):
                 self.learn()
-            yield self._figures(rollout)
+            yield self._figures(rollout) | {"td_error": error}
 
     def learn(self) -> None:
         """Evaluate and improve the policy on everything that was seen."""
@@ -118,7 +119,9 @@ class ActorCritic:
             with torch.no_grad():
                 action = actor.controller(observation).to(data.reward.dtype).clamp(-1, 1)
             slopes = equations.solve(actor.centre + actor.half_range * action)
-            self._follow(observation, *self._step(action, slopes), offset=sweep)
+            target, weight = self._step(action, slopes)
+            alive = ~data.terminated.unsqueeze(-1)  # no action is taken in terminal states
+            self._follow(observation, target, weight * alive, offset=sweep)
         self.solved = len(self.replay)
 
     def _remembered(self) -> Transitions:
@@ -145,8 +148,6 @@ class ActorCritic:
         std = torch.where(variance > 0, variance.sqrt(), 1.0)
         critic.target_loc.copy_(mean / (1 - config.discount))
         critic.target_scale.copy_(config.amplitude * std / (1 - config.discount))
-        noise = config.noise * (std / critic.target_scale).square()
-        critic.gp.log_noise_variance.copy_(noise.clamp_min(LEAST_NOISE).log())
 
     def _step(self, action: Tensor, slopes: Slopes) -> tuple[Tensor, Tensor]:
         """Actions that the controller should take instead, and how much each matters, [learners, N, A]."""
@@ -171,6 +172,17 @@ class ActorCritic:
             self.optimiser.step()
 
     @torch.no_grad()
+    def _surprise(self, rollout: TensorDictBase) -> Tensor:
+        """Root mean square of r + γ Q(s', f(s')) − Q(s, a) on experience that the critic has not seen."""
+        following = rollout.get("next")
+        observation = following.get("observation")
+        value = self.critic.mean_value(observation, self.actor(observation))
+        beyond = torch.where(following.get("terminated").squeeze(-1), 0.0, value)
+        target = following.get("reward").squeeze(-1) + self.config.discount * beyond
+        expected = self.critic.mean_value(rollout.get("observation"), rollout.get("action"))
+        return (target - expected).flatten(1).square().mean(1).sqrt()
+
+    @torch.no_grad()
     def _figures(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Figures of a rollout and of the critic, [learners] each."""
         ended = rollout.get(("next", "done")).squeeze(-1).flatten(1)
@@ -181,6 +193,7 @@ class ActorCritic:
         value = self.critic.mean_value(rollout.get("observation"), rollout.get("action"))
         return {
             "return": self._last_return,
+            "sigma": rollout.get("action_std").flatten(1).mean(1),
             "basis_size": self.critic.gp.size.clone(),
             "value": value.flatten(1).mean(1),
         }

@@ -32,7 +32,7 @@ class ActorCriticConfig:
 
     budget: int = 300  # basis vectors of the critic
     amplitude: float = 0.5  # prior deviation of values, in deviations of the reward over 1 − γ
-    noise: float = 1e-4  # noise variance of temporal differences, in variances of the reward
+    noise: float = 3e-4  # noise variance of temporal differences, in variances of the reward
     lengthscale: float = 1.0  # of observations, in their standard deviations times √columns
     action_lengthscale: float = 6.0  # of actions, in halves of the actuator's range
 

@@ -20,12 +20,11 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
-import tyro
 from torchrl import logger as torchrl_logger
 
 import envs
@@ -33,6 +32,8 @@ from torch_gprl.critics import GPActionValue, graph_edges
 from torch_gprl.learners import (
     ActorCritic,
     ActorCriticConfig,
+    DynamicProgramming,
+    DynamicProgrammingConfig,
     PolicyGradient,
     PolicyGradientConfig,
     QLearning,
@@ -120,28 +121,11 @@ class RunOptions:
             raise ValueError(f"collector {self.collector} needs workers: say how many by --workers")
 
 
-@dataclass(frozen=True)
-class PolicyGradientOptions:
-    """Improve a controller by policy gradients, with advantages from a Gaussian-process critic."""
+class Options(Protocol):
+    """What an algorithm is started with."""
 
-    run: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
-    algorithm: tyro.conf.OmitArgPrefixes[PolicyGradientConfig] = field(default_factory=PolicyGradientConfig)
-
-
-@dataclass(frozen=True)
-class QLearningOptions:
-    """Learn action values by a Gaussian process, and act greedily on them."""
-
-    run: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=lambda: RunOptions(num_envs=1))
-    algorithm: tyro.conf.OmitArgPrefixes[QLearningConfig] = field(default_factory=QLearningConfig)
-
-
-@dataclass(frozen=True)
-class ActorCriticOptions:
-    """Follow the slopes of a Gaussian-process critic that solves all experience anew: fewest steps."""
-
-    run: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=lambda: RunOptions(num_envs=1))
-    algorithm: tyro.conf.OmitArgPrefixes[ActorCriticConfig] = field(default_factory=ActorCriticConfig)
+    run: RunOptions
+    algorithm: Any  # the numbers of the algorithm
 
 
 # A rollout holds whole episodes, and values look ahead as far as the task's steps are short.
@@ -152,13 +136,16 @@ POLICY_GRADIENT_PRESETS: dict[str, dict[str, object]] = {
     "InvertedPendulum-v5": {"rollout_steps": 1000, "discount": 0.99},
     "HalfCheetah-v5": {"rollout_steps": 1000, "total_frames": 1_000_000, "discount": 0.99},
 }
-Options = PolicyGradientOptions | QLearningOptions | ActorCriticOptions
-Learner = PolicyGradient | QLearning | ActorCritic
+ALONE = RunOptions(num_envs=1)  # for learners that count every step
 ALGORITHMS = {
-    "policy-gradient": Algorithm(PolicyGradientOptions, PolicyGradient, POLICY_GRADIENT_PRESETS),
-    "q-learning": Algorithm(QLearningOptions, QLearning),
-    "actor-critic": Algorithm(ActorCriticOptions, ActorCritic),
+    "policy-gradient": Algorithm.offered(
+        PolicyGradient, RunOptions(), PolicyGradientConfig(), POLICY_GRADIENT_PRESETS
+    ),
+    "q-learning": Algorithm.offered(QLearning, ALONE, QLearningConfig()),
+    "actor-critic": Algorithm.offered(ActorCritic, ALONE, ActorCriticConfig()),
+    "dynamic-programming": Algorithm.offered(DynamicProgramming, ALONE, DynamicProgrammingConfig()),
 }
+Learner = PolicyGradient | QLearning | ActorCritic | DynamicProgramming
 
 
 def main(arguments: list[str]) -> int:
@@ -286,6 +273,8 @@ def collecting(learner: Learner, options: RunOptions) -> Iterator[None]:
     if not options.workers:
         yield
         return
+    if not isinstance(learner.critic, torch.nn.Module):
+        raise UserError("this learner's plan does not travel to other processes; leave --workers out")
     alone = options.collector == "multi-async"  # each worker makes whole rollouts
     share = options.num_envs if alone else options.num_envs // options.workers
     seeds = [options.seed + WORKER_STRIDE * worker for worker in range(options.workers)]

@@ -11,11 +11,23 @@ import pytest
 
 import train
 
-SMALL = {
-    "policy-gradient": "--rollout-steps 20 --total-frames 320 --budget 15 --trust-region 0.02",
-    "actor-critic": "--rollout-steps 10 --total-frames 160 --budget 15 --first-frames 40 --batch 16",
-    "q-learning": "--rollout-steps 10 --total-frames 160 --budget 15 --sweeps 3",
-}
+POLICY_GRADIENT = "policy-gradient --rollout-steps 20 --total-frames 320 --budget 15"
+Q_LEARNING = "q-learning --rollout-steps 10 --total-frames 160 --budget 15 --sweeps 3"
+SMALL = [
+    POLICY_GRADIENT,
+    Q_LEARNING,
+    "actor-critic --rollout-steps 10 --total-frames 160 --budget 15 --first-frames 40 --batch 16",
+]
+OTHERS = [
+    "dynamic-programming --rollout-steps 10 --total-frames 160 --model-budget 15 --support 20 --sweeps 3",
+    f"{POLICY_GRADIENT} --critic neural",
+    f"{POLICY_GRADIENT} --targets differences --estimator all-action --replay 100",
+    f"{POLICY_GRADIENT} --task HalfCheetah-v5",  # starts are drawn by Gymnasium's generators
+    f"{POLICY_GRADIENT} --exploration gibbs",
+    f"{POLICY_GRADIENT} --exploration confidence",
+    f"{POLICY_GRADIENT} --kernel geodesic",
+    f"{Q_LEARNING} --targets online",
+]
 COMMON = "--learners 2 --num-envs 2 --logger csv --checkpoint-interval"
 
 
@@ -46,11 +58,11 @@ def run(arguments: list[str], kill_after: float | None = None, longest_file: int
     return None if os.WIFSIGNALED(status) else os.waitstatus_to_exitcode(status)
 
 
-@pytest.fixture(scope="module", params=SMALL)
+@pytest.fixture(scope="module", params=[*SMALL, *(pytest.param(o, marks=pytest.mark.slow) for o in OTHERS)])
 def undisturbed(request, tmp_path_factory):
     """Name and options of a run, its metrics, and how long it took."""
     folder = tmp_path_factory.mktemp("undisturbed") / "run"
-    arguments = [request.param, *SMALL[request.param].split(), *COMMON.split()]
+    arguments = [*request.param.split(), *COMMON.split()]
     started = time.monotonic()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(train, "conclude", lambda *finished: None)  # evaluation and pictures take longer

@@ -213,7 +213,7 @@ def test_help_explains_every_option(name, capsys):
 def test_no_argument_means_policy_gradient_on_the_swing_up():
     name, options = train.parse([])
     assert name == "policy-gradient"
-    assert options == train.PolicyGradientOptions()
+    assert options.algorithm == train.PolicyGradientConfig()
     assert options.run.task == "pendulum-swingup"
 
 
@@ -308,11 +308,12 @@ def test_a_mistake_about_a_run_gets_one_line_and_exit_code_2(
 
 
 SMALL = {
-    "policy-gradient": "--rollout-steps 20 --total-frames 240",
-    "q-learning": "--rollout-steps 10 --total-frames 120 --sweeps 3",
-    "actor-critic": "--rollout-steps 10 --total-frames 120 --first-frames 40 --batch 16",
+    "policy-gradient": "--rollout-steps 20 --total-frames 240 --budget 15",
+    "q-learning": "--rollout-steps 10 --total-frames 120 --sweeps 3 --budget 15",
+    "dynamic-programming": "--rollout-steps 10 --total-frames 120 --model-budget 15 --support 20 --sweeps 3",
+    "actor-critic": "--rollout-steps 10 --total-frames 120 --first-frames 40 --batch 16 --budget 15",
 }
-SIZES = "--learners 2 --num-envs 2 --budget 15 --logger csv --checkpoint-interval 1000"
+SIZES = "--learners 2 --num-envs 2 --logger csv --checkpoint-interval 1000"
 
 
 def learned(name: str, folder: Path, task: str) -> int:
@@ -382,7 +383,7 @@ def test_constant_rewards_and_episodes_of_one_step_are_no_faults(name, oddity, t
 # ---------------------------------------------------------------- several processes
 
 
-WORKERS = f"--workers 2 {SIZES} --rollout-steps 20"
+WORKERS = f"--workers 2 {SIZES} --budget 15 --rollout-steps 20"
 
 
 @pytest.mark.slow

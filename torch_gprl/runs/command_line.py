@@ -41,6 +41,31 @@ class Algorithm:
     learner: type
     presets: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
 
+    @classmethod
+    def offered(
+        cls,
+        learner: type,
+        run: object,
+        numbers: object,
+        presets: Mapping[str, Mapping[str, object]] | None = None,
+    ) -> "Algorithm":
+        """An algorithm with options made of those of a run and its own numbers.
+
+        Args:
+            learner: the class that does it.
+            run: a frozen dataclass with the defaults of the run.
+            numbers: a frozen dataclass with the defaults of the algorithm; its docstring heads `--help`.
+            presets: task -> options that replace the defaults there.
+        """
+        fields = [
+            (name, tyro.conf.OmitArgPrefixes[type(part)], field(default_factory=lambda part=part: part))
+            for name, part in (("run", run), ("algorithm", numbers))
+        ]
+        options = dataclasses.make_dataclass(
+            "Options", fields, frozen=True, namespace={"__doc__": type(numbers).__doc__}
+        )
+        return cls(options, learner, presets or {})
+
     def parts(self) -> list[type]:
         """The dataclasses that hold the options."""
         default = self.options()

@@ -25,6 +25,7 @@ PICTURES = {
         "The best learner's V(s) = Q(s, f(s)) over a plane of states: posterior mean, standard deviation, "
         "and the basis vectors (circles) that carry both.",
     ),
+    "graph.png": ("Graph", "The experience that the critic's kernel measures distances on."),
     "foresight.png": (
         "Calibration",
         "The best learner's predictions along evaluation episodes against the discounted returns that came, "
@@ -146,7 +147,7 @@ def _metrics_figure(folder: RunFolder) -> Figure:
 def _picture(path: Path, name: str, about: str) -> str:
     if not path.exists():
         return ""
-    small = path.stem == "learning_curve"
+    small = path.stem in ("learning_curve", "graph")
     kind = ' class="small"' if small else ""
     image = f'<img{kind} alt="{escape(name)}" src="{_data(path, "image/png")}">'
     # Several panels side by side are scrolled on a narrow screen, or nobody could read them.

@@ -11,8 +11,8 @@ import torch
 import envs
 from torch_gprl.critics import EstimatorName, KernelName
 from torch_gprl.gp import AgeAwareScore
-from torch_gprl.learners import PolicyGradient, PolicyGradientConfig
-from torch_gprl.learners.config import BY_STATE_VALUES, Optimiser, Targets
+from torch_gprl.learners import PolicyGradient, PolicyGradientConfig, teaching
+from torch_gprl.learners.config import BY_STATE_VALUES, Optimiser
 
 ENVS, STEPS = 4, 25
 
@@ -57,9 +57,11 @@ def test_every_optimiser_moves_the_policy(optimiser):
     assert all(not torch.equal(old, new) for old, new in zip(before, made.policy.parameters(), strict=True))
 
 
-@pytest.mark.parametrize("targets", get_args(Targets))
-@pytest.mark.parametrize("name", get_args(KernelName))
-def test_every_kernel_serves(name, targets):
+@pytest.mark.parametrize(
+    ("name", "targets"), [*((name, "returns") for name in get_args(KernelName)), ("geodesic", "differences")]
+)
+def test_every_kernel_serves(name, targets, monkeypatch):
+    monkeypatch.setattr(teaching, "FIRST_FIT", 8)
     made = learner(2, kernel=name, targets=targets, visited=120)
     for figures in made.train():
         assert (figures["gradient_norm"] > 0).all()

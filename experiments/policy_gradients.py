@@ -53,7 +53,7 @@ CLAIM_2: dict[str, dict[str, Any]] = {
 PANELS = {
     "return": "return per episode",
     "gradient_cosine": "cosine of gradients from two halves",
-    "value_error": "RMSE of Q against roll-outs, right after a policy update",
+    "value_error": "RMSE of Q right after a policy update",
     "outdated": "share of basis vectors out of date",
 }
 SMOOTHED = 5  # updates

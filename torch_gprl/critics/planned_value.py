@@ -10,8 +10,8 @@ support, so sweeps nearly contract; a smoother kernel overshoots and the maximum
 keep to the attainable range. Support states are visited ones, states a few imagined steps away, and the ends
 that were seen, whose value is zero.
 
-A second value, for exploration, takes what the model does not know for the best attainable (optimism in the
-face of uncertainty): a share `doubt` of the backup is the highest value there is.
+A second value, for exploration, takes what the model does not know for better than all that was seen
+(optimism in the face of uncertainty): a share of each backup, as large as the doubt, is the highest hope.
 """
 
 import math
@@ -49,7 +49,7 @@ class Planning:
     backup_actions: int = 9  # actions compared in a sweep
     lengthscale: float = 2.0  # of values, in the observations' standard deviations times √columns
     novelty_lengthscale: float = 0.5  # in which a state counts as new, likewise
-    optimism: float = 1.0  # share of what the doubt is worth, when exploring
+    optimism: float = 1.0  # the unknown is hoped to hold the best seen, and so many attainable ranges more
 
 
 class _Support(NamedTuple):
@@ -123,7 +123,7 @@ class PlannedValue:
         if before is not None:
             values = self._values_of(before, observation)
             average = values[..., EXPLOIT].mean(1, keepdim=True)
-        prior = torch.stack([average, self._high], -1)
+        prior = torch.stack([average, self._hope], -1)
         none = torch.zeros_like(prior.expand(-1, scaled.shape[1], -1))
         loc, scale = self.model.loc, self.model.scale
         self._support = _Support(observation, scaled, ends, loc, scale, prior, none)
@@ -198,6 +198,7 @@ class PlannedValue:
         horizon = 1 - self.planning.discount
         self._low = torch.where(ends, low.clamp_max(0), low) / horizon
         self._high = torch.where(ends, high.clamp_min(0), high) / horizon
+        self._hope = self._high + self.planning.optimism * (self._high - self._low)
 
     def _iterate(self, values: Tensor, sweeps: int) -> None:
         """Value iteration at the support."""
@@ -211,11 +212,12 @@ class PlannedValue:
         cross = self._kernel(self._scaled(step.observation), support.scaled)
         eye = torch.eye(support.scaled.shape[1], dtype=cross.dtype, device=cross.device)
         factor = cholesky(self._kernel(support.scaled, support.scaled) + VALUE_NOISE * eye)
+        lowest, highest = self._range()
         for _ in range(sweeps):
             weights = torch.cholesky_solve(self._residual(values), factor)
-            beyond = torch.clamp(cross @ weights + support.prior, self._low[..., None], self._high[..., None])
+            beyond = torch.clamp(cross @ weights + support.prior, lowest, highest)
             backup = step.reward.unsqueeze(-1) + lasting.unsqueeze(-1) * beyond
-            backup = torch.lerp(backup, self._high[..., None].expand_as(backup), unknown)
+            backup = torch.lerp(backup, highest.expand_as(backup), unknown)
             values = backup.unflatten(1, (count, -1)).amax(2)
         weights = torch.cholesky_solve(self._residual(values), factor)
         self._support = support._replace(weights=weights)
@@ -232,13 +234,17 @@ class PlannedValue:
     def _unknown(self, following: Tensor, doubt: Tensor, lasting: Tensor) -> Float[Tensor, "L N 2"]:
         """Share of a backup that is not known, for both values; zero for the one that exploits."""
         new = torch.maximum(doubt, self._novelty(following) * lasting / self.planning.discount)
-        return torch.stack([torch.zeros_like(new), (self.planning.optimism * new).clamp(max=1.0)], -1)
+        return torch.stack([torch.zeros_like(new), new], -1)
+
+    def _range(self) -> tuple[Float[Tensor, "L 1 1"], Float[Tensor, "L 1 2"]]:
+        """Lowest and highest of both values."""
+        return self._low.unsqueeze(-1), torch.stack([self._high, self._hope], -1)
 
     def _values_of(self, support: _Support, observation: Tensor) -> Float[Tensor, "L N 2"]:
         unit = self.planning.lengthscale * math.sqrt(observation.shape[-1])
         scaled = (observation - support.loc) / (support.scale * unit)
         values = self._kernel(scaled, support.scaled) @ support.weights + support.prior
-        return torch.clamp(values, self._low[..., None], self._high[..., None])
+        return torch.clamp(values, *self._range())
 
     # ---------------------------------------------------------------- acting
 
@@ -255,7 +261,7 @@ class PlannedValue:
         if not explore:
             return value
         unknown = self._unknown(step.observation, step.doubt, lasting)[..., EXPLORE]
-        return torch.lerp(value, self._high.expand_as(value), unknown)
+        return torch.lerp(value, self._hope.expand_as(value), unknown)
 
     @torch.no_grad()
     def best_action(self, observation: Float[Tensor, "L N S"], explore: bool) -> Float[Tensor, "L N A"]:

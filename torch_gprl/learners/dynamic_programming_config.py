@@ -39,7 +39,7 @@ class DynamicProgrammingConfig:
     lengthscale: float = 2.0  # of values, in standard deviations of the observations times √columns
     novelty_lengthscale: float = 0.5  # in which a state counts as new, likewise
 
-    optimism: float = 1.0  # share of what doubt is worth when exploring; 0 trusts the model
+    optimism: float = 1.0  # exploring hopes for the best seen and so many ranges of value more
     std: float = 0.1  # standard deviation of noise round the best action, in halves of the actuator's range
 
     def __post_init__(self) -> None:

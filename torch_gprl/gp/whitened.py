@@ -258,7 +258,12 @@ class WhitenedState(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is derived, which a copy makes anew."""
+        _before_save(self, "", False)
         return {**self.__dict__, "_active_rows": None, "_solution": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._accept_state()  # a copied state is up to date with the copied kernel
 
     def _kernel_versions(self) -> tuple[int, ...]:
         return id(self.kernel), *(tensor._version for tensor in self._kernel_tensors)

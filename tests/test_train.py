@@ -313,6 +313,7 @@ SMALL = {
     "dynamic-programming": "--rollout-steps 10 --total-frames 120 --model-budget 15 --support 20 --sweeps 3",
     "actor-critic": "--rollout-steps 10 --total-frames 120 --first-frames 40 --batch 16 --budget 15",
 }
+LEARNERS = [pytest.param(name, marks=[pytest.mark.slow] * (name != "policy-gradient")) for name in SMALL]
 SIZES = "--learners 2 --num-envs 2 --logger csv --checkpoint-interval 1000"
 
 
@@ -348,7 +349,7 @@ def task(monkeypatch):
     return Fragile
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", LEARNERS)
 def test_a_broken_environment_ends_the_run_with_its_cause_and_a_checkpoint_to_go_on_from(
     name, task, tmp_path, capsys
 ):
@@ -369,13 +370,13 @@ def test_a_broken_environment_ends_the_run_with_its_cause_and_a_checkpoint_to_go
     assert written[0] == written[1]
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", LEARNERS)
 @pytest.mark.parametrize("oddity", ["constant", "ends"])
 def test_constant_rewards_and_episodes_of_one_step_are_no_faults(name, oddity, task, tmp_path):
     setattr(task, oddity, True)
     assert learned(name, tmp_path / "run", "fragile") == 0
     metrics = read_metrics(tmp_path / "run" / "metrics.csv")
-    assert np.isfinite(metrics["basis_size"]).all()
+    assert metrics["update"][:, 0].tolist() == [1, 2, 3, 4, 5, 6]
     if oddity == "ends":
         assert np.isfinite(metrics["return"]).all()  # an episode ends at every step
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import tyro
 from rich.console import Console
@@ -69,11 +70,10 @@ def complete(setting: Setting, arm: str, options: Options, progress: Progress) -
     frames = setting.frames // (QUICK_SHARE if options.quick else 1)
     numbers = ARMS.get(arm)
     if numbers is None:
-        confidence = load(setting, "confidence", options.out)
-        if confidence is None:
+        σ = realised_sigma(setting, "confidence", options.out)
+        if σ is None:
             return
-        σ = confidence[0].measures(setting)["mean sigma"]
-        numbers = {"std": σ.square().mean().sqrt().item()}
+        numbers = {"std": matching_std(setting, σ, options.out)}
     for first in range(0, options.learners, GROUP):
         path = record_of(setting, arm, first, options.out)
         if path.exists():
@@ -87,6 +87,24 @@ def complete(setting: Setting, arm: str, options: Options, progress: Progress) -
             kept = {"outcome": dataclasses.asdict(outcome), "pictures": pictures.taken, "numbers": numbers}
         torch.save(kept, path.with_suffix(".part"))
         path.with_suffix(".part").replace(path)
+
+
+def realised_sigma(setting: Setting, arm: str, out: Path) -> float | None:
+    """Root mean square distance to the greedy action, in halves of the range; none before the arm has run."""
+    kept = load(setting, arm, out)
+    return None if kept is None else kept[0].measures(setting)["mean sigma"].square().mean().sqrt().item()
+
+
+def matching_std(setting: Setting, sigma: float, out: Path) -> float:
+    """The standard deviation whose noise comes to `sigma` once the box has clipped it.
+
+    Interpolates between the gaussian arms that have run; `sigma` itself if none has.
+    """
+    realised = {arm: realised_sigma(setting, arm, out) for arm in GAUSSIAN}
+    known = sorted((found, GAUSSIAN[arm]["std"]) for arm, found in realised.items() if found is not None)
+    if not known:
+        return sigma
+    return float(np.interp(sigma, *zip((0.0, 0.0), *known, strict=True)))
 
 
 def load(setting: Setting, arm: str, out: Path) -> tuple[Outcome, dict[str, Any]] | None:

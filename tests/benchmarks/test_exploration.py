@@ -84,6 +84,15 @@ def test_finished_arms_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert json.loads(results.read_text(encoding="utf-8"))["pendulum-explore"] == first
 
 
+def test_matched_noise_is_as_large_once_it_is_clipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    realised = {"gaussian 0.3": 0.2, "gaussian 1.0": 0.6}
+    monkeypatch.setattr(exploration, "realised_sigma", lambda setting, arm, out: realised.get(arm))
+    for sigma, std in ((0.1, 0.15), (0.2, 0.3), (0.4, 0.65), (0.6, 1.0)):
+        assert exploration.matching_std(SETTING, sigma, tmp_path) == pytest.approx(std)
+    realised.clear()
+    assert exploration.matching_std(SETTING, 0.4, tmp_path) == 0.4
+
+
 def test_an_arm_that_does_not_exist_is_named():
     with pytest.raises(SystemExit, match="unknown task or arm: luck; choose from"):
         main(Options(arms=("luck",)))

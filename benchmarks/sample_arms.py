@@ -206,14 +206,14 @@ ARMS = {
 }
 MAIN = tuple(ARMS)
 # what each part brings: run by name
-CEILING = ConfidenceScale(noise_scale=1e6, floor=0.6, ceiling=0.6)
+BY_CONFIDENCE = ConfidenceScale(noise_scale=100.0, floor=0.1, ceiling=0.6)
 ARMS |= {
     "q-learning, online": ours("QLearning", targets="online"),
     "q-learning, squared exponential": ours("QLearning", kernel="squared-exponential"),
     "q-learning, half the noise": ours("QLearning", std=0.3),
     "q-learning, optimistic": ours("QLearning", optimism=1.0),
     "q-learning, pessimistic": ours("QLearning", optimism=-1.0),
-    "actor-critic, same noise everywhere": ours("ActorCritic", confidence=CEILING),
+    "actor-critic, noise by confidence": ours("ActorCritic", confidence=BY_CONFIDENCE),
     "actor-critic, one sweep": ours("ActorCritic", sweeps=1),
     "actor-critic, steps of any length": ours("ActorCritic", trust_region=10.0),
     "actor-critic, short steps": ours("ActorCritic", trust_region=0.1),

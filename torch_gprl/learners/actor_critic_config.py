@@ -20,8 +20,8 @@ class ActorCriticConfig:
     first_frames: int = 100  # environment steps per learner before it learns
     growth: float = 0.02  # share by which experience grows between two solutions
 
-    # how far to explore where values are uncertain; a noise scale of 100 takes 0.05 deviations to 0.5
-    confidence: ConfidenceScale = field(default_factory=lambda: ConfidenceScale(100.0, 0.1, 0.6))
+    # noise of the actions, wider where values are uncertain if floor and ceiling differ
+    confidence: ConfidenceScale = field(default_factory=lambda: ConfidenceScale(100.0, 0.6, 0.6))
 
     sweeps: int = 4  # solutions of the critic in a row, each followed by a step of the policy
     trust_region: float = 0.5  # root mean square of a step of the policy, in halves of the actuator's range

@@ -308,11 +308,13 @@ def draw(learner: Learner, options: RunOptions, folder: RunFolder, best: int) ->
     save_figure(curve, folder.figures / "learning_curve.png")
     env = make_env(options, num_envs=1, seed=EVALUATION_SEED)
     critic, title = learner.critic, f"{options.task}, best learner"
-    if env.plane is not None and isinstance(critic, GPActionValue):
-        surface = value_on_plane(critic, learner.policy, env.plane, best)
+    judges = hasattr(critic, "basis_points")  # a neural critic has no opinion of its own errors
+    if env.plane is not None and judges:
+        surface = value_on_plane(critic, learner.policy, env.plane, best, options.learners)
         save_figure(value_surface(surface, title), folder.figures / "value_surface.png")
-        save_graph(graph_edges(critic, best), surface, env.plane, folder.figures / "graph.png", title)
-    if isinstance(critic, GPActionValue):
+        if isinstance(critic, GPActionValue):
+            save_graph(graph_edges(critic, best), surface, env.plane, folder.figures / "graph.png", title)
+    if judges:
         starts = make_env(options, JUDGED_EPISODES, EVALUATION_SEED)
         foresight = foresee(starts, learner.policy, critic, learner.config.discount, best)
         save_figure(foresight_figure(foresight, title), folder.figures / "foresight.png")

@@ -192,3 +192,14 @@ def test_the_value_is_differentiable_in_the_action():
     made.update(data)
     state, action = data["observation"][:3], data["action"][:3].requires_grad_()
     assert torch.autograd.gradcheck(lambda action: made.mean_value(state, action), action)
+
+
+def test_basis_vectors_are_points_of_the_data_in_their_own_units():
+    data = experience(LEARNERS, ENVS, STEPS)
+    made = standardised(LEARNERS, data=data)
+    made.update(data)
+    seen = torch.cat([data["observation"], data["action"]], -1).flatten(1, 2).double()
+    for learner, points in enumerate(seen):
+        basis = made.basis_points(learner)
+        assert len(basis) == int(made.gp.size[learner])
+        assert torch.cdist(basis, points).amin(1).max() < 1e-4

@@ -19,14 +19,10 @@ def test_the_value_surface_shows_the_chosen_learner_where_it_belongs():
         mean = observation[..., 0] + 10 * observation[..., 1] + 100 * action[..., 0]
         return Posterior(mean, observation[..., 0].square())
 
-    gp = SimpleNamespace(
-        basis=torch.tensor([[[9.0] * 3] * 4, [[0.5, -1.0, 7.0]] * 4]), size=torch.tensor([1, 3])
-    )
-    scaling = {
-        "input_scale": torch.tensor([[1.0] * 3, [2.0, 3.0, 1.0]]),
-        "input_loc": torch.full((2, 3), 0.25),
-    }
-    critic = SimpleNamespace(gp=gp, value=value, **scaling)
+    def basis_points(learner: int) -> torch.Tensor:
+        return [torch.full((1, 3), 9.0), torch.tensor([[1.25, -2.75, 7.0]] * 3)][learner]
+
+    critic = SimpleNamespace(basis_points=basis_points, value=value)
     plane = SimpleNamespace(
         labels=("x", "y"),
         low=(-1.0, -2.0),
@@ -34,7 +30,7 @@ def test_the_value_surface_shows_the_chosen_learner_where_it_belongs():
         to_observation=lambda p: p,
         from_observation=lambda o: o,
     )
-    surface = value_on_plane(critic, policy, plane, learner=1)
+    surface = value_on_plane(critic, policy, plane, learner=1, learners=2)
 
     x, y = torch.meshgrid(torch.tensor(surface.x), torch.tensor(surface.y), indexing="xy")
     assert surface.mean == pytest.approx((201 * x + 10 * y).numpy(), abs=1e-4)

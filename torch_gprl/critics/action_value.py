@@ -75,6 +75,11 @@ class GPActionValue(TensorDictModuleBase):
         """Posterior of Q in units of the return, at observations [*batch, ..., D] and actions."""
         return self._in_units(self.gp.posterior(self.inputs(observation, action)), observation)
 
+    def basis_points(self, learner: int) -> Tensor:
+        """A learner's basis vectors [size, D] in their own units: observations, then actions."""
+        used = self.gp.basis[learner, : int(self.gp.size[learner])]
+        return used * self.input_scale[learner] + self.input_loc[learner]
+
     def mean_value(self, observation: Tensor, action: Tensor) -> Tensor:
         """Posterior mean of Q alone [*batch, ...], several times cheaper than `value`."""
         return self._mean_in_units(self.inputs(observation, action), observation)

@@ -288,7 +288,7 @@ class PlannedValue:
         unknown = torch.maximum(step.doubt, self._novelty(step.observation))
         return Posterior(mean, unknown * (self._high - self._low).square())
 
-    def basis_states(self, learner: int) -> Float[Tensor, "M S"]:
+    def basis_points(self, learner: int) -> Float[Tensor, "M S"]:
         """The support states of a learner, as observations."""
         assert self._support is not None
         return self._support.observation[learner]

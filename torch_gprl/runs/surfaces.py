@@ -28,23 +28,24 @@ class PicturePlane(Protocol):
 
 @torch.no_grad()
 def value_on_plane(
-    critic: Any,  # noqa: ANN401  (an action value with a Gaussian process: this floor knows none)
+    critic: Any,  # noqa: ANN401  (a critic with a Gaussian process: this floor knows none)
     policy: TensorDictModuleBase,
     plane: PicturePlane,
     learner: int,
+    learners: int,
 ) -> Surface:
     """One learner's posterior of V(s) = Q(s, f(s)) on a grid of a plane of states.
 
     Args:
-        critic: has `value(observation, action)`, `input_loc`, `input_scale` and `gp` with `basis`, `size`.
+        critic: has `value(observation, action)` and `basis_points(learner)`, which begin with observations.
         policy: its deterministic action is f(s).
         plane: where to look.
         learner: whose value.
+        learners: how many critic and policy are made for.
     """
-    gp = critic.gp
-    learners = len(gp.size)
+    basis = critic.basis_points(learner)
     x, y = (torch.linspace(low, high, GRID) for low, high in zip(plane.low, plane.high, strict=True))
-    points = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2).to(gp.basis.device)
+    points = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2).to(basis.device)
     observations = plane.to_observation(points).float()
     means, variances = [], []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -55,13 +56,11 @@ def value_on_plane(
             value = critic.value(states["observation"], policy(states)["action"])
             means.append(value.mean[learner])
             variances.append(value.variance[learner])
-    basis = gp.basis[learner, : int(gp.size[learner])] * critic.input_scale[learner]
-    observed = (basis + critic.input_loc[learner])[:, : observations.shape[-1]]
     return Surface(
         x=x.double().numpy(),
         y=y.double().numpy(),
         mean=torch.cat(means).double().cpu().numpy().reshape(GRID, GRID),
         stddev=torch.cat(variances).double().sqrt().cpu().numpy().reshape(GRID, GRID),
-        basis=plane.from_observation(observed).double().cpu().numpy(),
+        basis=plane.from_observation(basis[:, : observations.shape[-1]]).double().cpu().numpy(),
         labels=plane.labels,
     )

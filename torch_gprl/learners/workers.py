@@ -87,21 +87,19 @@ class WorkerCollection:
 
     def _start(self) -> None:
         folder = Path(self._folder.name)
-        modules = list(copied_for_workers(self._followed, len(self.factories)))
+        modules = copied_for_workers(self._followed, len(self.factories))
         sample = self.factories[0]()
         frames = self.steps * sample.batch_size.numel()
         sample.close()
-        options: dict[str, Any] = {"frames_per_batch": frames}
         kind: type[MultiSyncCollector | MultiAsyncCollector] = MultiAsyncCollector
+        options: dict[str, Any] = {}
         if not self.asynchronous:
-            kind = MultiSyncCollector
-            options = {
-                "frames_per_batch": frames * len(modules),
-                "cat_results": 1,
-            }  # environments side by side
+            kind, frames = MultiSyncCollector, frames * len(modules)
+            options = {"cat_results": 1}  # environments side by side
         self._collector = kind(
             [functools.partial(made, factory) for factory in self.factories],
             policy_factory=[functools.partial(FollowingPolicy, part, self._board.folder) for part in modules],
+            frames_per_batch=frames,
             total_frames=-1,
             weight_sync_schemes={"policy": NoWeightSyncScheme()},
             auto_register_policy_transforms=False,

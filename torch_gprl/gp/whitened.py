@@ -111,7 +111,7 @@ class WhitenedState(nn.Module):
         self.register_buffer("clock", torch.zeros((), **integer))
         self.register_buffer("evidence_constant", like.new_zeros(batch))
         self.register_buffer("observations", torch.zeros(batch, **integer))
-        # derived from the above, see `refresh`
+        # derived from the above for compiled readers, see `refresh`
         self.register_buffer("precision_factor", eye.clone(), persistent=False)
         self.register_buffer("weights", like.new_zeros(*batch, rows), persistent=False)
 

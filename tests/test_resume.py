@@ -97,6 +97,7 @@ def test_a_killed_run_resumes_bit_for_bit(undisturbed, tmp_path):
     kill_points(undisturbed, tmp_path, 3)
 
 
+@pytest.mark.parametrize("undisturbed", [POLICY_GRADIENT], indirect=True)
 def test_a_run_that_filled_the_disk_resumes_bit_for_bit(undisturbed, tmp_path):
     arguments, metrics, _ = undisturbed
     folder = tmp_path / "run"
@@ -108,5 +109,6 @@ def test_a_run_that_filled_the_disk_resumes_bit_for_bit(undisturbed, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("undisturbed", [POLICY_GRADIENT], indirect=True)
 def test_a_killed_run_resumes_bit_for_bit_wherever_it_was_killed(undisturbed, tmp_path):
     kill_points(undisturbed, tmp_path, 20)

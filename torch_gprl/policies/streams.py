@@ -55,7 +55,7 @@ class NoiseStream:
 
     def split(self, count: int) -> list["NoiseStream"]:
         """Streams for `count` copies of a policy, seeded from this one, which moves on."""
-        parts = [copy.copy(self) for _ in range(count)]
+        parts: list[NoiseStream] = [copy.copy(self) for _ in range(count)]
         for part in parts:
             seeds = [torch.randint(2**62, (), generator=generator) for generator in self._generators]
             part._generators = [torch.Generator().manual_seed(int(seed)) for seed in seeds]

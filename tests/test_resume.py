@@ -20,7 +20,8 @@ OTHERS = [
     f"{POLICY_GRADIENT} --critic neural",
     f"{POLICY_GRADIENT} --targets differences --estimator all-action --replay 100",
     f"{POLICY_GRADIENT} --task HalfCheetah-v5",  # starts are drawn by Gymnasium's generators
-    f"{POLICY_GRADIENT} --exploration gibbs",
+    f"{Q_LEARNING} --exploration gibbs",
+    f"{Q_LEARNING} --exploration thompson",
     f"{POLICY_GRADIENT} --exploration confidence",
     f"{POLICY_GRADIENT} --kernel geodesic",
     f"{Q_LEARNING} --targets online",

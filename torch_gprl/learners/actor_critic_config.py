@@ -16,7 +16,7 @@ class ActorCriticConfig:
 
     total_frames: int = 2_000  # environment steps per learner, over all its environments
     rollout_steps: int = 10  # steps of each environment between two looks at the critic
-    discount: float = 0.97  # γ per environment step, from 0 to 1
+    discount: float = 0.96  # γ per environment step, from 0 to 1
     first_frames: int = 100  # environment steps per learner before it learns
     growth: float = 0.02  # share by which experience grows between two solutions
 

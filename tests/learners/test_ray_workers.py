@@ -71,16 +71,36 @@ def test_without_ray_the_way_out_is_named(monkeypatch):
         RayCollection([functools.partial(pendulums, 0)], scene()[0], STEPS)
 
 
+def nowhere() -> EnvBase:
+    raise OSError("no simulator on this machine")
+
+
+def ray_options() -> dict:
+    paths = {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
+    options = {"num_cpus": 2, "include_dashboard": False, "log_to_driver": False}
+    return options | {"runtime_env": {"env_vars": paths}}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # Ray's own
+def test_a_worker_that_fails_tells_why():
+    pytest.importorskip("ray", reason="needs the extra ray")
+    factories = [functools.partial(pendulums, 0), nowhere]
+    collection = RayCollection(factories, scene()[0], STEPS, cpus=0.5, ray_options=ray_options())
+    with (
+        contextlib.closing(collection),
+        pytest.raises(RuntimeError, match=r"(?s)a worker failed.*no simulator"),
+    ):
+        collection.rollout()
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # Ray's own
 def test_rays_workers_act_by_the_learners_critic():
     pytest.importorskip("ray", reason="needs the extra ray")
     policy, critic = scene()
-    paths = {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
-    options = {"num_cpus": 2, "include_dashboard": False, "log_to_driver": False}
-    options |= {"runtime_env": {"env_vars": paths}}
     factories = [functools.partial(pendulums, seed) for seed in range(2)]
-    collection = RayCollection(factories, policy, STEPS, critic, cpus=0.5, ray_options=options)
+    collection = RayCollection(factories, policy, STEPS, critic, cpus=0.5, ray_options=ray_options())
     with contextlib.closing(collection):
         for _ in range(2):
             learn(critic)

@@ -84,8 +84,8 @@ class DifferenceEquations:
         gp = self.critic.gp
         inputs = self.critic.inputs(self.transitions.next_observation, next_action)
         following = radial(self.kernel, inputs, self.basis)
-        self.design = (self.cross - self.rate.unsqueeze(-1) * following.value) * self.mask
-        observe_anew(gp, self.design, self.targets)
+        design = (self.cross - self.rate.unsqueeze(-1) * following.value) * self.mask
+        observe_anew(gp, design, self.targets)
         columns = slice(-next_action.shape[-1], None)
         lengthscale = self.kernel.lengthscale[..., columns]
         weights = gp.alpha[..., : self.basis.shape[-2]]

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from torch_gprl.critics.planned_value import IMAGINED_STEPS, PlannedValue, Planning
-from torch_gprl.critics.transition_model import TransitionModel, Transitions
+from torch_gprl.critics import PlannedValue, Planning, TransitionModel, Transitions
+from torch_gprl.critics.planned_value import IMAGINED_STEPS
 
 BOUND = torch.ones(1, dtype=torch.float64)
 

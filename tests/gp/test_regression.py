@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from torch_gprl.gp import ExactGP
-from torch_gprl.gp.regression import SparseRegression, farthest_points
+from torch_gprl.gp import ExactGP, SparseRegression, farthest_points
 from torch_gprl.kernels import Linear, SquaredExponential
 
 

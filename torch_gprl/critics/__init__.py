@@ -14,7 +14,9 @@ from torch_gprl.critics.kernels_by_name import (
     store_transitions,
 )
 from torch_gprl.critics.maximise import ActionMaximiser, Maximum
+from torch_gprl.critics.planned_value import PlannedValue, Planning
 from torch_gprl.critics.returns import k_step_returns
+from torch_gprl.critics.transition_model import TransitionModel, Transitions
 from torch_gprl.critics.value_estimator import Critic, GPStateValue, GPValueEstimator
 
 __all__ = [
@@ -29,6 +31,10 @@ __all__ = [
     "GPValueEstimator",
     "KernelName",
     "Maximum",
+    "PlannedValue",
+    "Planning",
+    "TransitionModel",
+    "Transitions",
     "action_moments",
     "action_value_kernel",
     "clear_graphs",

@@ -366,6 +366,7 @@ def test_a_broken_environment_ends_the_run_with_its_cause_and_a_checkpoint_to_go
 
     task.bad_from = 10**9
     assert train.main(["--resume", str(tmp_path / "broken")]) == 0
+    assert not (tmp_path / "broken" / "failure.txt").exists()
     written = [(tmp_path / run / "metrics.csv").read_bytes() for run in ("whole", "broken")]
     assert written[0] == written[1]
 

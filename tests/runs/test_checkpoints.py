@@ -106,6 +106,16 @@ def test_a_checkpoint_that_is_not_there_is_refused_with_those_that_are(tmp_path)
         checkpoints.at(7)
 
 
+def test_what_a_kill_left_of_a_checkpoint_is_swept_away_by_the_next(tmp_path):
+    checkpoints = Checkpoints(tmp_path, learner=Learner())
+    first = checkpoints.save(1)
+    (tmp_path / ".checkpoint-000000000002.torchrl.archive-0f").write_bytes(b"half")
+    (tmp_path / ".checkpoint-000000000002.torchrl.stage-0f" / "components").mkdir(parents=True)
+    assert checkpoints.latest() == first
+    second = checkpoints.save(2)
+    assert sorted(tmp_path.iterdir()) == [first, second]
+
+
 def test_a_full_disk_leaves_the_last_checkpoint(tmp_path):
     learner = Learner()
     checkpoints = Checkpoints(tmp_path, learner=learner)

@@ -7,6 +7,7 @@ comparison of shapes before anything is overwritten, and a flush to the disk.
 
 import os
 import re
+import shutil
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -26,6 +27,7 @@ from torchrl.checkpoint import (
 from torch_gprl.runs.errors import UserError
 
 NAME = re.compile(r"checkpoint-(\d+)\.torchrl")
+LEFT_BY_A_KILL = ".checkpoint-*"  # what TorchRL had not yet renamed
 KEPT = 2  # the newest, and the one before in case the newest was cut off by a crash
 
 
@@ -67,6 +69,8 @@ class Checkpoints:
         Returns:
             The new file.
         """
+        for left in self._rotation.directory.glob(LEFT_BY_A_KILL):
+            shutil.rmtree(left) if left.is_dir() else left.unlink()
         path = self._rotation.save(self._checkpoint, step=step)
         for place in (path, path.parent):  # the file's bytes, then its name
             descriptor = os.open(place, os.O_RDONLY)

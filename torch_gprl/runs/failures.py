@@ -25,9 +25,13 @@ class Counted(Protocol):
 
 @contextlib.contextmanager
 def failures_of(learner: Counted, folder: RunFolder) -> Iterator[None]:
-    """Within it whatever breaks becomes a `RunFailure`, and its trace goes into the run's folder."""
+    """Within it whatever breaks becomes a `RunFailure`, and its trace goes into the run's folder.
+
+    If nothing does, the trace of an earlier failure is taken away.
+    """
     try:
         yield
+        folder.failure.unlink(missing_ok=True)
     except UserError:
         raise
     except Exception as error:

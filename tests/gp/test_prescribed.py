@@ -1,9 +1,9 @@
-"""A prescribed basis: farthest points by hand, and all data at once against the stream."""
+"""A prescribed basis: what joins it, and all data at once against the stream."""
 
 import torch
 
 from torch_gprl.gp import SparseOnlineGP
-from torch_gprl.gp.prescribed import LEAST_DISTANCE, adopt_basis, farthest_points, observe_anew
+from torch_gprl.gp.prescribed import LEAST_DISTANCE, adopt_basis, observe_anew
 from torch_gprl.kernels import Matern
 
 LENGTHSCALE = torch.tensor([0.5, 2.0], dtype=torch.float64)
@@ -12,16 +12,6 @@ LENGTHSCALE = torch.tensor([0.5, 2.0], dtype=torch.float64)
 def process(budget: int = 12, noise: float = 0.1) -> SparseOnlineGP:
     kernel = Matern(2, LENGTHSCALE, batch_shape=(2,), smoothness=2.5)
     return SparseOnlineGP(kernel, budget, noise, novelty_threshold=1e9, projection="dtc", overshoot=1)
-
-
-def test_each_pick_is_the_point_farthest_from_those_before():
-    points = torch.randn(2, 40, 3, dtype=torch.float64)
-    index, size = farthest_points(points, 10)
-    assert size.tolist() == [10, 10]
-    for picks, row in zip(index, points, strict=True):
-        for count in range(1, 10):
-            nearest = torch.cdist(row, row[picks[:count]]).amin(1)
-            assert picks[count] == nearest.argmax()
 
 
 def test_near_duplicates_do_not_join_the_basis():

@@ -1,9 +1,8 @@
 """Several targets on one basis: the dense posterior where nothing is dropped, FITC where something is."""
 
-import pytest
 import torch
 
-from torch_gprl.gp import ExactGP, SparseRegression, farthest_points
+from torch_gprl.gp import ExactGP, SparseRegression
 from torch_gprl.kernels import Linear, SquaredExponential
 
 
@@ -38,21 +37,3 @@ def test_on_fewer_vectors_it_is_fitc():
     weighted = cross / (noise[:, None] + novelty)[:, None]
     expected = torch.linalg.solve(gram + weighted @ cross.mT, weighted @ targets)
     torch.testing.assert_close(regression.coefficients, expected, rtol=1e-7, atol=1e-8)
-
-
-def test_farthest_points_cover_the_others_at_most_twice_as_widely_as_any_choice():
-    points = torch.tensor([[0.0], [1.0], [10.0], [11.0], [20.0], [21.0]])
-    chosen = farthest_points(points, 3)
-    assert sorted((points[chosen, 0] // 10).tolist()) == [0, 1, 2]  # one of each pair
-
-
-def test_farthest_points_are_all_points_when_there_are_few_and_no_point_twice():
-    points = torch.zeros(2, 5, 3)  # all alike
-    assert farthest_points(points, 9).sort(-1).values.tolist() == [list(range(5))] * 2
-
-
-@pytest.mark.parametrize("count", [1, 4])
-def test_each_batch_entry_chooses_for_itself(count):
-    points = torch.randn(3, 20, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    together = farthest_points(points, count)
-    assert torch.equal(together, torch.stack([farthest_points(each, count) for each in points]))

@@ -13,7 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import LogNormal
 
-from torch_gprl.gp.regression import SparseRegression, farthest_points
+from torch_gprl.gp import SparseRegression
+from torch_gprl.graphs import farthest_points
 from torch_gprl.kernels import Kernel, Linear, SquaredExponential
 from torch_gprl.linalg import CholeskyError, cholesky
 
@@ -83,7 +84,7 @@ class Regressor:
             spaced = torch.linspace(0, inputs.shape[1] - 1, min(FIT_POINTS, inputs.shape[1])).long()
             self._fit(inputs[:, spaced], targets[:, spaced])
         lengths = self.bends.lengthscale.detach().unsqueeze(-2)
-        chosen = farthest_points(inputs / lengths, self.budget)
+        chosen = farthest_points(inputs / lengths, self.budget).index
         basis = inputs.take_along_dim(chosen.unsqueeze(-1), 1)
         self._regression = SparseRegression(self.kernel, basis, inputs, targets, self.log_noise.exp())
 

@@ -6,7 +6,7 @@ from torch_gprl.gp.parallel import ParallelSparseGP, broadcast_state
 from torch_gprl.gp.posterior import Posterior
 from torch_gprl.gp.pruning import AgeAwareScore, BasisStatistics, InformationScore, PruningScore
 from torch_gprl.gp.recursion import RecursiveGP
-from torch_gprl.gp.regression import SparseRegression, farthest_points
+from torch_gprl.gp.regression import SparseRegression
 from torch_gprl.gp.sample_paths import Paths, PathSampler
 from torch_gprl.gp.sparse_online import SparseOnlineGP
 
@@ -24,6 +24,5 @@ __all__ = [
     "SparseOnlineGP",
     "SparseRegression",
     "broadcast_state",
-    "farthest_points",
     "fit_hyperparameters",
 ]

@@ -9,11 +9,12 @@ state that is written is that of `whitened`.
 import math
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torch_gprl.gp.sparse_online import SparseOnlineGP
 from torch_gprl.gp.whitened import solve_triangular
+from torch_gprl.graphs.covering import farthest_points
 from torch_gprl.kernels.stationary import Stationary
 
 LEAST_DISTANCE = 0.02  # length scales: nearer points say the same, and ruin the Gram matrix' condition
@@ -29,36 +30,14 @@ def adopt_basis(gp: SparseOnlineGP, inputs: Float[Tensor, "*batch N D"]) -> None
     """
     assert isinstance(gp.kernel, Stationary)
     scaled = inputs / gp.kernel.lengthscale.unsqueeze(-2)
-    index, size = farthest_points(scaled, min(gp.budget, inputs.shape[-2]))
+    index, distance = farthest_points(scaled, gp.budget)
+    size = (distance > LEAST_DISTANCE).sum(-1)
     rows = index.shape[-1]
     gp.reset()
     chosen = inputs.gather(-2, index.unsqueeze(-1).expand(*index.shape, inputs.shape[-1]))
     gp.size.copy_(size)
     gp.basis[..., :rows, :] = torch.where(gp.mask[..., :rows, None], chosen, 0.0)
     gp.rebase()  # the Gram factor of the new basis; there is nothing else to keep
-
-
-def farthest_points(
-    points: Float[Tensor, "*batch N D"], count: int
-) -> tuple[Int[Tensor, "*batch M"], Int[Tensor, "*batch"]]:
-    """Indices of `count` points, the first and then always the one farthest from those before.
-
-    Returns:
-        the indices, and how many of them are farther than `LEAST_DISTANCE` from all before.
-    """
-    square = points.square().sum(-1)
-    nearest = torch.full_like(square, torch.inf)
-    index = torch.zeros(*square.shape[:-1], 1, dtype=torch.long, device=points.device)
-    picks, distinct = [], torch.ones_like(index[..., 0])
-    for pick in range(count):
-        picks.append(index)
-        point = points.gather(-2, index.unsqueeze(-1).expand(*index.shape, points.shape[-1]))
-        away = square - 2 * (points @ point.mT).squeeze(-1) + square.gather(-1, index)
-        nearest = torch.minimum(nearest, away)
-        farthest, index = nearest.max(-1, keepdim=True)
-        if pick + 1 < count:
-            distinct += (farthest.squeeze(-1) > LEAST_DISTANCE**2).long()
-    return torch.cat(picks, -1), distinct
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ Ghahramani, 2006, for the weights)
 """
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torch_gprl.kernels import Kernel
@@ -55,23 +55,3 @@ class SparseRegression:
         half = torch.linalg.solve_triangular(self._precision_factor, phi, upper=False)
         explained = phi.square().sum(-2) - half.square().sum(-2)
         return (self._kernel.diag(inputs) - explained).clamp_min(0)
-
-
-@torch.no_grad()
-def farthest_points(points: Float[Tensor, "*batch N D"], count: int) -> Int[Tensor, "*batch M"]:
-    """Indices of min(count, N) points that cover all others: each is the farthest from those before it.
-
-    The first is the last of the points. Gonzalez (1985): no choice covers more than twice as tightly.
-    """
-    flat = points.reshape(-1, *points.shape[-2:])
-    rows, last = torch.arange(len(flat), device=points.device), flat.shape[1] - 1
-    square = flat.square().sum(-1)
-    distance = torch.full_like(square, torch.inf)
-    chosen = [torch.full_like(rows, last)]
-    for _ in range(min(count, flat.shape[1]) - 1):
-        newest = flat[rows, chosen[-1]].unsqueeze(-1)
-        away = square + square[rows, chosen[-1]].unsqueeze(-1) - 2 * (flat @ newest).squeeze(-1)
-        distance = torch.minimum(distance, away)
-        distance[rows, chosen[-1]] = -torch.inf  # or roundoff might choose a point twice
-        chosen.append(distance.argmax(-1))
-    return torch.stack(chosen, -1).reshape(*points.shape[:-2], -1)

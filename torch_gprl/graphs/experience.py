@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torch_gprl.graphs.covering import farthest_points
 from torch_gprl.graphs.interpolation import COINCIDENT, Neighbours, gather_rows, neighbours
 
 SLOPE_RIDGE = 1e-3  # of the squared reach of the neighbours: keeps slopes finite along directions never tried
@@ -124,7 +125,9 @@ class Experience(nn.Module):
         self.after_nodes[..., used, :] = after.nodes
         self.after_weights[..., used, :] = after.weight
         self.ends[..., used] = (after.distance[..., 0] > COINCIDENT) & ~self.terminated[..., used]
-        self.landmarks.copy_(_farthest_points(self.states[..., used, :], self.landmarks.shape[-1]))
+        chosen = farthest_points(self.states[..., used, :], self.landmarks.shape[-1]).index
+        # some twice if there are too few
+        self.landmarks.copy_(chosen[..., torch.arange(self.landmarks.shape[-1]) % chosen.shape[-1]])
 
     def nearest(self, x: Float[Tensor, "*#batch N D"]) -> Neighbours:
         """The visited states that speak for x [*batch, N, D]."""
@@ -152,14 +155,3 @@ class Experience(nn.Module):
         ridge = SLOPE_RIDGE * (weight.sum(-2) * reach.square()).unsqueeze(-1) * eye
         slope = torch.linalg.solve((weight * X).mT @ X + ridge, (weight * X).mT @ Y)
         return slope.mT + eye
-
-
-def _farthest_points(points: Tensor, count: int) -> Tensor:
-    """Indices of points, each the farthest from those before it; some twice if there are too few."""
-    chosen = [torch.zeros(points.shape[:-2], dtype=torch.long, device=points.device)]
-    distance = torch.full(points.shape[:-1], torch.inf, dtype=points.dtype, device=points.device)
-    for _ in range(count - 1):
-        last = chosen[-1][..., None, None].expand(*points.shape[:-2], 1, points.shape[-1])
-        distance = torch.minimum(distance, (points - points.gather(-2, last)).norm(dim=-1))
-        chosen.append(distance.argmax(-1))
-    return torch.stack(chosen, -1)

@@ -145,7 +145,7 @@ class PlannedValue:
         """Learn from all visited states where the task ends, and what is new."""
         visited = self._scaled(torch.cat([data.observation, data.following], 1))
         labels = torch.cat([torch.zeros_like(data.terminated), data.terminated], 1)
-        chosen = farthest_points(visited, self.planning.support).index
+        chosen = farthest_points(visited, self.planning.support).chosen
         scaled = visited.take_along_dim(chosen.unsqueeze(-1), 1)
         labels = labels.gather(1, chosen)
         eye = torch.eye(scaled.shape[1], dtype=scaled.dtype, device=scaled.device)
@@ -179,7 +179,7 @@ class PlannedValue:
         pool = torch.cat([known, imagined], 1)
         over = (self._end(pool) > 0.5).unsqueeze(-1)
         pool = torch.where(over, visited[:, -1:], pool)  # visited states that are no ends fill the places
-        chosen = farthest_points(self._scaled(pool), self.planning.support).index
+        chosen = farthest_points(self._scaled(pool), self.planning.support).chosen
         return pool.take_along_dim(chosen.unsqueeze(-1), 1)
 
     def _with_ends(self, scaled: Tensor) -> tuple[Tensor, Tensor]:

@@ -84,7 +84,7 @@ class Regressor:
             spaced = torch.linspace(0, inputs.shape[1] - 1, min(FIT_POINTS, inputs.shape[1])).long()
             self._fit(inputs[:, spaced], targets[:, spaced])
         lengths = self.bends.lengthscale.detach().unsqueeze(-2)
-        chosen = farthest_points(inputs / lengths, self.budget).index
+        chosen = farthest_points(inputs / lengths, self.budget).chosen
         basis = inputs.take_along_dim(chosen.unsqueeze(-1), 1)
         self._regression = SparseRegression(self.kernel, basis, inputs, targets, self.log_noise.exp())
 

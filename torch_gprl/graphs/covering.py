@@ -14,11 +14,11 @@ class Cover(NamedTuple):
     """Points chosen one by one.
 
     Attributes:
-        index: [*batch, M] which, no point twice.
+        chosen: [*batch, M] indices, no point twice.
         distance: [*batch, M] of each to the nearest of those before it, falling; infinite for the first.
     """
 
-    index: Int[Tensor, "*batch M"]
+    chosen: Int[Tensor, "*batch M"]
     distance: Float[Tensor, "*batch M"]
 
 

@@ -125,7 +125,7 @@ class Experience(nn.Module):
         self.after_nodes[..., used, :] = after.nodes
         self.after_weights[..., used, :] = after.weight
         self.ends[..., used] = (after.distance[..., 0] > COINCIDENT) & ~self.terminated[..., used]
-        chosen = farthest_points(self.states[..., used, :], self.landmarks.shape[-1]).index
+        chosen = farthest_points(self.states[..., used, :], self.landmarks.shape[-1]).chosen
         # some twice if there are too few
         self.landmarks.copy_(chosen[..., torch.arange(self.landmarks.shape[-1]) % chosen.shape[-1]])
 

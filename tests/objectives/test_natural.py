@@ -160,3 +160,26 @@ def test_conjugate_gradients_stay_put_once_they_have_converged():
     scale = torch.tensor([[1.0], [100.0], [0.01]], dtype=torch.float64)
     solution = conjugate_gradients(lambda vector: scale * vector, right, 50)  # one iteration would do
     torch.testing.assert_close(solution, right / scale)
+
+
+def test_a_step_that_the_fisher_matrix_cannot_judge_is_shortened():
+    """KL = ½ (|d|² 1e-8 + 1e4 |d|⁴): the quadratic form sees only the first part."""
+    weight = parameter(DIMS)
+    before = weight.detach().clone()
+
+    def divergence() -> Tensor:
+        square = (weight - before).square().sum(-1)
+        return 0.5 * (1e-8 * square + 1e4 * square.square())
+
+    natural_step([weight], divergence, TRUST)
+    assert (divergence() <= 4 * TRUST).all()
+    assert ((weight - before).abs().sum(-1) > 0).all()
+
+
+def test_a_learner_without_any_curvature_stays_where_it_is():
+    weight, states = parameter(DIMS), features()
+    states[1] = 0  # the policy of this learner does not depend on its parameters where it has been
+    before = weight.detach().clone()
+    natural_step([weight], linear_divergence(weight, states), TRUST)
+    assert torch.equal(weight[1], before[1])
+    assert (weight[[0, 2]] != before[[0, 2]]).all()

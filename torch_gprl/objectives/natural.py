@@ -10,6 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+TOLERANCE = 4.0  # trust regions that a step may take in truth: its length comes from a quadratic form
+SHORTENINGS = 8  # tenfold, of a step that would take more; then it is not taken
+
 
 def natural_step(
     parameters: Sequence[nn.Parameter],
@@ -19,6 +22,8 @@ def natural_step(
     damping: float = 1e-3,
 ) -> Float[Tensor, " learners"]:
     """Move `parameters` against their `.grad` by the natural gradient, as far as `max_divergence`.
+
+    Steps that would diverge several times as far are shortened.
 
     Args:
         parameters: each [learners, ...], with gradients of a loss that is a sum over learners.
@@ -36,7 +41,7 @@ def natural_step(
     curvature = (gradient * fisher(gradient)).sum(-1, keepdim=True)
     relative = damping * curvature / gradient.square().sum(-1, keepdim=True).clamp_min(1e-30)
     direction = conjugate_gradients(lambda v: fisher(v) + relative * v, gradient, iterations)
-    _move(parameters, -direction, fisher, max_divergence)
+    _move(parameters, -direction, fisher, divergence, max_divergence)
     return gradient.norm(dim=-1)
 
 
@@ -55,7 +60,8 @@ def step_along(
         divergence: as `natural_step`.
         max_divergence: as `natural_step`.
     """
-    _move(parameters, direction, _fisher_products(parameters, divergence), max_divergence)
+    fisher = _fisher_products(parameters, divergence)
+    _move(parameters, direction, fisher, divergence, max_divergence)
 
 
 def _fisher_products(
@@ -76,12 +82,26 @@ def _move(
     parameters: Sequence[nn.Parameter],
     direction: Tensor,
     fisher: Callable[[Tensor], Tensor],
+    divergence: Callable[[], Tensor],
     max_divergence: float,
 ) -> None:
     quadratic = (direction * fisher(direction)).sum(-1, keepdim=True)
     size = (2 * max_divergence / quadratic.clamp_min(1e-30)).sqrt()
-    for parameter, step in zip(parameters, _unflatten(size * direction, parameters), strict=True):
-        parameter.add_(step)
+    flat = quadratic <= 1e-30 * direction.square().sum(-1, keepdim=True)  # nothing to learn a length from
+    step = torch.nan_to_num(torch.where(flat, 0.0, size * direction), nan=0.0, posinf=0.0, neginf=0.0)
+    before = [parameter.clone() for parameter in parameters]
+    near = torch.zeros_like(step[:, 0], dtype=torch.bool)
+    # where the Fisher matrix almost vanishes, its quadratic form promises steps that are far too long
+    for _ in range(SHORTENINGS):
+        for parameter, old, part in zip(parameters, before, _unflatten(step, parameters), strict=True):
+            parameter.copy_(old + part)
+        near = divergence() <= TOLERANCE * max_divergence  # NaN is not
+        if near.all():
+            return
+        step = torch.where(near.unsqueeze(-1), step, 0.1 * step)
+    for parameter, old in zip(parameters, before, strict=True):
+        keep = near.reshape(-1, *[1] * (parameter.ndim - 1))
+        parameter.copy_(torch.where(keep, parameter, old))
 
 
 def conjugate_gradients(

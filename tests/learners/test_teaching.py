@@ -75,7 +75,8 @@ def test_exploration_is_learned_or_fixed_or_on_schedule():
         half = made.policy.head.half_range
         spreads[exploration] = torch.stack([figures["sigma"] / half for figures in made.train()])[:, 0]
     torch.testing.assert_close(spreads["fixed"], torch.full((4,), 0.5).double())
-    torch.testing.assert_close(spreads["scheduled"], torch.tensor([0.4, 0.3, 0.2, 0.1]).double())
+    torch.testing.assert_close(spreads["scheduled"], torch.tensor([0.5, 0.4, 0.3, 0.2]).double())  # as acted
+    assert (made.policy.std / half - 0.1).abs().max() < 1e-6
     assert not torch.isclose(spreads["learned"][-1], spreads["fixed"][-1])
 
 

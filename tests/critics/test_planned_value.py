@@ -70,7 +70,7 @@ def test_doubt_grows_away_from_the_data():
 
 
 def test_values_are_those_of_value_iteration_on_a_fine_table():
-    value = planned(walk(), discount=0.9)
+    value = planned(walk(), discount=0.9, tremble=0.01)
     states, values = by_tables(0.9)
     best = value.best_action(grid(), explore=False)
     found = value.action_values(grid(), best, explore=False)
@@ -96,6 +96,16 @@ def test_an_end_is_worth_nothing_and_attracts_where_every_step_costs():
         rtol=0,
         atol=0.1,
     )
+
+
+def test_a_trembling_hand_keeps_away_from_an_edge():
+    """Every step is paid 1 until the end beyond 1: of the actions that stay, all are worth the same."""
+    data = walk(end=1.0)
+    data = data._replace(reward=torch.ones_like(data.reward))
+    near = torch.full((2, 1, 1), 0.8, dtype=torch.float64)  # actions above 0.4 end the task
+    steady, careful = (planned(data, tremble=tremble).best_action(near, False) for tremble in (0.01, 0.25))
+    assert (careful < -0.3).all()
+    assert (careful <= steady).all()
 
 
 def test_values_keep_to_the_attainable_range():

@@ -10,6 +10,9 @@ support, so sweeps nearly contract; a smoother kernel overshoots and the maximum
 keep to the attainable range. Support states are visited ones, states a few imagined steps away, and the ends
 that were seen, whose value is zero.
 
+The maximum is taken over averages of nearby actions, as if the hand trembled. Where many actions serve
+equally well, up to an edge beyond which none does, this keeps away from the edge.
+
 A second value, for exploration, takes what the model does not know for better than all that was seen
 (optimism in the face of uncertainty): a share of each backup, as large as the doubt, is the highest hope.
 """
@@ -49,6 +52,7 @@ class Planning:
     backup_actions: int = 9  # actions compared in a sweep
     lengthscale: float = 2.0  # of values, in the observations' standard deviations times √columns
     novelty_lengthscale: float = 0.5  # in which a state counts as new, likewise
+    tremble: float = 0.25  # standard deviation of actions that is planned for, in halves of their range
     optimism: float = 1.0  # the unknown is hoped to hold the best seen, and so many attainable ranges more
 
 
@@ -213,14 +217,20 @@ class PlannedValue:
         eye = torch.eye(support.scaled.shape[1], dtype=cross.dtype, device=cross.device)
         factor = cholesky(self._kernel(support.scaled, support.scaled) + VALUE_NOISE * eye)
         lowest, highest = self._range()
+        trembling = self._trembling(actions)
         for _ in range(sweeps):
             weights = torch.cholesky_solve(self._residual(values), factor)
             beyond = torch.clamp(cross @ weights + support.prior, lowest, highest)
             backup = step.reward.unsqueeze(-1) + lasting.unsqueeze(-1) * beyond
             backup = torch.lerp(backup, highest.expand_as(backup), unknown)
-            values = backup.unflatten(1, (count, -1)).amax(2)
+            values = (trembling @ backup.unflatten(1, (count, -1))).amax(2)
         weights = torch.cholesky_solve(self._residual(values), factor)
         self._support = support._replace(weights=weights)
+
+    def _trembling(self, actions: Float[Tensor, "J A"]) -> Float[Tensor, "J J"]:
+        """Weights by which the value of an action is averaged over actions near it."""
+        away = torch.cdist(actions, actions, compute_mode="donot_use_mm_for_euclid_dist")
+        return torch.softmax(-0.5 * (away / self.planning.tremble).square(), -1)
 
     def _residual(self, values: Tensor) -> Tensor:
         """Values at the support less their prior mean; at ends the value is zero."""
@@ -266,14 +276,14 @@ class PlannedValue:
     @torch.no_grad()
     def best_action(self, observation: Float[Tensor, "L N S"], explore: bool) -> Float[Tensor, "L N A"]:
         """The best of the candidate actions, in halves of the actuator's range."""
-        actions = self._acting_actions
+        actions, trembling = self._acting_actions, self._trembling(self._acting_actions)
         each = len(observation) * len(actions) * (self.model.budget + self.planning.support)
         best = []
         for some in observation.split(max(1, CHUNK // each), 1):
             spread = some.repeat_interleave(len(actions), 1)
             tried = actions.repeat(some.shape[1], 1).expand(len(some), -1, -1)
             value = self.action_values(spread, tried, explore)
-            best.append(actions[value.unflatten(1, (some.shape[1], -1)).argmax(-1)])
+            best.append(actions[(value.unflatten(1, (some.shape[1], -1)) @ trembling.mT).argmax(-1)])
         return torch.cat(best, 1)
 
     def value(self, observation: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"]) -> Posterior:

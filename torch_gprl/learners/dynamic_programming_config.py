@@ -16,7 +16,7 @@ LEAST = {
     "backup_actions": 3,
     "acting_actions": 3,
 }
-POSITIVE = ("lengthscale", "novelty_lengthscale")
+POSITIVE = ("lengthscale", "novelty_lengthscale", "tremble")
 NOT_NEGATIVE = ("std", "optimism", "growth")
 
 
@@ -38,6 +38,7 @@ class DynamicProgrammingConfig:
     acting_actions: int = 21  # actions compared when acting
     lengthscale: float = 2.0  # of values, in standard deviations of the observations times √columns
     novelty_lengthscale: float = 0.5  # in which a state counts as new, likewise
+    tremble: float = 0.25  # standard deviation of actions to plan for, in halves of the actuator's range
 
     optimism: float = 1.0  # exploring hopes for the best seen and so many ranges of value more
     std: float = 0.1  # standard deviation of noise round the best action, in halves of the actuator's range
@@ -71,5 +72,6 @@ class DynamicProgrammingConfig:
             self.backup_actions,
             self.lengthscale,
             self.novelty_lengthscale,
+            self.tremble,
             self.optimism,
         )

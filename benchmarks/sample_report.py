@@ -117,7 +117,10 @@ def draw(records: Records, goals: Mapping[str, Goal]) -> Figure:
     rows = max(1, -(-len(tasks) // columns))
     figure = Figure(figsize=(4.6 * columns, 3.6 * rows), layout="constrained")
     arms = list(dict.fromkeys(record["arm"] for record in records))
-    for axes, task in zip(figure.subplots(rows, columns, squeeze=False).flat, tasks, strict=False):
+    places = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for empty in places[len(tasks) :]:
+        empty.remove()
+    for axes, task in zip(places, tasks, strict=False):
         for arm in arms:
             own = [record for record in records if (record["task"], record["arm"]) == (task, arm)]
             if own:
@@ -133,6 +136,7 @@ def draw(records: Records, goals: Mapping[str, Goal]) -> Figure:
         for threshold in goals[task].thresholds:
             axes.axhline(threshold, color="0.4", linestyle="--", linewidth=0.8)
         axes.set(xscale="log", title=task, xlabel="environment steps", ylabel="return")
+        axes.xaxis.set_minor_formatter("")
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False, fontsize="x-small")
     return figure

@@ -25,7 +25,7 @@ from torch_gprl.gp import SparseOnlineGP
 from torch_gprl.gp.prescribed import adopt_basis
 from torch_gprl.kernels import Matern
 from torch_gprl.learners.actor_critic_config import ActorCriticConfig
-from torch_gprl.learners.collecting import Collection
+from torch_gprl.learners.collecting import Collection, batch_of, mean_return
 from torch_gprl.policies import ConfidenceNoise, MLPController, NoiseStream, ScaledController
 from torch_gprl.policies.gaussian import action_bounds
 
@@ -53,12 +53,8 @@ class ActorCritic:
     def __init__(
         self, env: EnvBase, config: ActorCriticConfig, seed: int = 0, first_learner: int = 0
     ) -> None:
-        if len(env.batch_size) != 2:
-            raise ValueError(
-                f"the environment's batch must be [learners, environments], got {tuple(env.batch_size)}"
-            )
         self.env, self.config = env, config
-        self.learners, num_envs = env.batch_size
+        self.learners, num_envs = batch_of(env)
         indices = range(first_learner, first_learner + self.learners)
         spec = env.observation_spec["observation"]
         states, actions = spec.shape[-1], env.action_spec.shape[-1]
@@ -185,11 +181,7 @@ class ActorCritic:
     @torch.no_grad()
     def _figures(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Figures of a rollout and of the critic, [learners] each."""
-        ended = rollout.get(("next", "done")).squeeze(-1).flatten(1)
-        returns = rollout.get(("next", "episode_reward")).squeeze(-1).flatten(1)
-        mean = (returns * ended).sum(1) / ended.sum(1)
-        # no episode ended: the last known
-        self._last_return = torch.where(ended.any(1), mean, self._last_return)
+        self._last_return = mean_return(rollout, self._last_return)
         value = self.critic.mean_value(rollout.get("observation"), rollout.get("action"))
         return {
             "return": self._last_return,

@@ -7,6 +7,7 @@ TorchRL's `Collector` carries the environment's present state from rollout to ro
 import math
 from typing import Any
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -114,3 +115,24 @@ def _refuse_non_finite(tensordict: TensorDictBase, key: str) -> None:
             f"environment {env} is {value[tuple(bad[0])].item()}; "
             "look for a diverged simulation or a faulty reward"
         )
+
+
+def batch_of(env: EnvBase) -> tuple[int, int]:
+    """Learners and environments of each, the batch of a learner's environment.
+
+    Raises:
+        ValueError: the batch is another.
+    """
+    if len(env.batch_size) != 2:
+        raise ValueError(
+            f"the environment's batch must be [learners, environments], got {tuple(env.batch_size)}"
+        )
+    learners, num_envs = env.batch_size
+    return learners, num_envs
+
+
+def mean_return(rollout: TensorDictBase, last: Tensor) -> Tensor:
+    """Mean return of the episodes that ended in a rollout [learners]; the `last` one known where none did."""
+    ended = rollout.get(("next", "done")).squeeze(-1).flatten(1)
+    returns = rollout.get(("next", "episode_reward")).squeeze(-1).flatten(1)
+    return torch.where(ended.any(1), (returns * ended).sum(1) / ended.sum(1), last)

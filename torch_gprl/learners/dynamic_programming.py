@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 
 from torch_gprl.critics.planned_value import IMAGINED_STEPS, PlannedValue
 from torch_gprl.critics.transition_model import TransitionModel, Transitions
-from torch_gprl.learners.collecting import Collection
+from torch_gprl.learners.collecting import Collection, batch_of, mean_return
 from torch_gprl.learners.dynamic_programming_config import DynamicProgrammingConfig
 from torch_gprl.learners.q_learning import action_box_of
 from torch_gprl.policies.gaussian import explores
@@ -93,12 +93,8 @@ class DynamicProgramming:
     def __init__(
         self, env: EnvBase, config: DynamicProgrammingConfig, seed: int = 0, first_learner: int = 0
     ) -> None:
-        if len(env.batch_size) != 2:
-            raise ValueError(
-                f"the environment's batch must be [learners, environments], got {tuple(env.batch_size)}"
-            )
         self.env, self.config = env, config
-        self.learners, num_envs = env.batch_size
+        self.learners, num_envs = batch_of(env)
         states = env.observation_spec["observation"].shape[-1]
         low, high = action_box_of(env)
         indices = range(first_learner, first_learner + self.learners)
@@ -175,11 +171,7 @@ class DynamicProgramming:
         return (predicted - new.reward).square().mean(1).sqrt()
 
     def _figures(self, rollout: TensorDictBase) -> dict[str, Tensor]:
-        ended = rollout.get(("next", "done")).squeeze(-1).flatten(1)
-        returns = rollout.get(("next", "episode_reward")).squeeze(-1).flatten(1)
-        mean = (returns * ended).sum(1) / ended.sum(1)
-        # no episode ended: the last known
-        self._last_return = torch.where(ended.any(1), mean, self._last_return)
+        self._last_return = mean_return(rollout, self._last_return)
         return {"return": self._last_return}
 
     def state_dict(self) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from torch.distributions import kl_divergence
 from torchrl.envs import EnvBase
 
 from torch_gprl.critics import USE_ALL_ACTIONS, Evaluation, GPActionValue, GPValueEstimator
-from torch_gprl.learners.collecting import Collection
+from torch_gprl.learners.collecting import Collection, batch_of, mean_return
 from torch_gprl.learners.config import GUIDED, PolicyGradientConfig
 from torch_gprl.learners.neural_value import NeuralTeacher, NeuralValue
 from torch_gprl.learners.teaching import Teacher, make_critic
@@ -63,12 +63,8 @@ class PolicyGradient:
     def __init__(
         self, env: EnvBase, config: PolicyGradientConfig, seed: int = 0, first_learner: int = 0
     ) -> None:
-        if len(env.batch_size) != 2:
-            raise ValueError(
-                f"the environment's batch must be [learners, environments], got {tuple(env.batch_size)}"
-            )
         self.env, self.config = env, config
-        self.learners, num_envs = env.batch_size
+        self.learners, num_envs = batch_of(env)
         indices = range(first_learner, first_learner + self.learners)
         dims = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
         controller = _controller(config.controller, *dims, indices, seed).to(
@@ -260,12 +256,7 @@ class PolicyGradient:
     @torch.no_grad()
     def _figures(self, rollout: TensorDictBase, seen: Evaluation) -> dict[str, Tensor]:
         """Figures of the rollout, and of the critic as it stood before it, [learners] each."""
-        ended = rollout.get(("next", "done")).squeeze(-1).flatten(1)
-        returns = rollout.get(("next", "episode_reward")).squeeze(-1).flatten(1)
-        mean = (returns * ended).sum(1) / ended.sum(1)
-        self._last_return = torch.where(
-            ended.any(1), mean, self._last_return
-        )  # no episode ended: the last known
+        self._last_return = mean_return(rollout, self._last_return)
         error = (seen.to_go - seen.taken).flatten(1)
         surprise = (seen.to_go - seen.value).flatten(1)
         return self.teacher.figures() | {

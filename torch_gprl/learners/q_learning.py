@@ -19,7 +19,7 @@ from torch_gprl.critics import GPActionValue
 from torch_gprl.critics.maximise import ActionMaximiser
 from torch_gprl.gp import SparseOnlineGP
 from torch_gprl.kernels import Columns, Kernel, Matern, SquaredExponential
-from torch_gprl.learners.collecting import Collection
+from torch_gprl.learners.collecting import Collection, batch_of, mean_return
 from torch_gprl.learners.q_learning_config import QLearningConfig
 from torch_gprl.learners.q_targets import FittedQ, OnlineQ
 from torch_gprl.policies import BehaviourPolicy
@@ -42,12 +42,8 @@ class QLearning:
     """
 
     def __init__(self, env: EnvBase, config: QLearningConfig, seed: int = 0, first_learner: int = 0) -> None:
-        if len(env.batch_size) != 2:
-            raise ValueError(
-                f"the environment's batch must be [learners, environments], got {tuple(env.batch_size)}"
-            )
         self.env, self.config = env, config
-        self.learners, num_envs = env.batch_size
+        self.learners, num_envs = batch_of(env)
         states = env.observation_spec["observation"].shape[-1]
         low, high = action_box_of(env)
         self.critic = make_critic(config, self.learners, states, low, high)
@@ -90,11 +86,7 @@ class QLearning:
 
     def _figures(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Figures of a rollout and of the critic that it made, [learners] each."""
-        ended = rollout.get(("next", "done")).squeeze(-1).flatten(1)
-        returns = rollout.get(("next", "episode_reward")).squeeze(-1).flatten(1)
-        mean = (returns * ended).sum(1) / ended.sum(1)
-        # no episode ended: the last known
-        self._last_return = torch.where(ended.any(1), mean, self._last_return)
+        self._last_return = mean_return(rollout, self._last_return)
         return {
             "return": self._last_return,
             "basis_size": self.critic.gp.size.clone(),

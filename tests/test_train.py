@@ -338,7 +338,7 @@ def task(monkeypatch):
             whole = super().reward(before, action, after)
             if Fragile.steps >= Fragile.bad_from:
                 return whole._replace(total=whole.total * float("nan"))
-            return whole._replace(total=torch.ones_like(whole.total)) if Fragile.constant else whole
+            return whole._replace(total=0 * whole.total + 1) if Fragile.constant else whole
 
         def terminated(self, state):
             return super().terminated(state) | Fragile.ends

@@ -56,7 +56,7 @@ def test_several_environments_of_a_learner_share_one_experience():
     learner = make(num_envs=3)
     for _ in learner.train():
         pass
-    assert learner.state_dict()["experience"]["reward"].shape == (2, 150)
+    assert learner.experience.all()["reward"].shape == (2, 150)
 
 
 def test_ends_of_the_task_are_learned():

@@ -220,7 +220,7 @@ def test_values_stay_within_what_rewards_can_add_up_to():
     target = teacher._first_targets(data)
     assert (target <= 1 / (1 - DISCOUNT)).all()
     assert (target >= 0).all()
-    assert process.gp.observations == len(teacher.replay) == 80
+    assert process.gp.observations == len(teacher.experience) == 80
 
 
 @pytest.mark.parametrize("hindsight", [True, False])

@@ -16,7 +16,6 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
 from torch_gprl.critics import GPActionValue
@@ -26,6 +25,7 @@ from torch_gprl.gp.prescribed import adopt_basis
 from torch_gprl.kernels import Matern
 from torch_gprl.learners.actor_critic_config import ActorCriticConfig
 from torch_gprl.learners.collecting import Collection, batch_of, mean_return
+from torch_gprl.learners.experience import Experience
 from torch_gprl.policies import ConfidenceNoise, MLPController, NoiseStream, ScaledController
 from torch_gprl.policies.gaussian import action_bounds
 
@@ -68,7 +68,7 @@ class ActorCritic:
         self.policy = ConfidenceNoise(self.actor, self.critic, config.confidence, noise)
         self.optimiser = torch.optim.Adam(controller.parameters(), config.learning_rate, betas=(0.9, 0.99))
         self.collection = Collection(env, self.policy, config.rollout_steps)
-        self.replay = TensorDictReplayBuffer(storage=LazyTensorStorage(config.total_frames))
+        self.experience = Experience(config.total_frames)
         self.frames_per_update = num_envs * config.rollout_steps
         self.total_updates = -(-config.total_frames // self.frames_per_update)
         self.updates = self.solved = self.renewed = 0
@@ -94,18 +94,17 @@ class ActorCritic:
         """Run the remaining updates; yields figures of each, [learners] every one."""
         while self.updates < self.total_updates:
             rollout = self.collection.rollout()
-            experience = rollout.select(*REMEMBERED).reshape(self.learners, -1)
-            self.replay.extend(experience.transpose(0, 1))
+            self.experience.extend(rollout.select(*REMEMBERED).reshape(self.learners, -1))
             self.updates += 1
-            seen, error = len(self.replay), self._surprise(rollout)
+            seen, error = len(self.experience), self._surprise(rollout)
             if seen >= self.config.first_frames and seen >= self.solved * (1 + self.config.growth):
                 self.learn()
             yield self._figures(rollout) | {"td_error": error}
 
     def learn(self) -> None:
         """Evaluate and improve the policy on everything that was seen."""
-        data = self._remembered()
-        if len(self.replay) >= self.renewed * RENEWAL:
+        data = Transitions.of(self.experience.all(), self.critic.input_loc)
+        if len(self.experience) >= self.renewed * RENEWAL:
             self._renew(data)
         self._scale_values(data)
         equations = DifferenceEquations(self.critic, data, self.config.discount)
@@ -118,12 +117,7 @@ class ActorCritic:
             target, weight = self._step(action, slopes)
             alive = ~data.terminated.unsqueeze(-1)  # no action is taken in terminal states
             self._follow(observation, target, weight * alive, offset=sweep)
-        self.solved = len(self.replay)
-
-    def _remembered(self) -> Transitions:
-        stored = self.replay[:]
-        assert isinstance(stored, TensorDictBase)
-        return Transitions.of(stored.transpose(0, 1), self.critic.input_loc)
+        self.solved = len(self.experience)
 
     def _renew(self, data: Transitions) -> None:
         """Scale inputs by all that was seen, actions by their range, and choose the basis among all."""
@@ -134,7 +128,7 @@ class ActorCritic:
         critic.input_scale.copy_(torch.cat([std, actor.half_range.expand(len(loc), -1)], -1))
         actor.controller.standardise(loc, std)
         adopt_basis(critic.gp, critic.inputs(data.observation, data.action))
-        self.renewed = len(self.replay)
+        self.renewed = len(self.experience)
 
     @torch.no_grad()
     def _scale_values(self, data: Transitions) -> None:
@@ -200,7 +194,7 @@ class ActorCritic:
             "policy": self.policy.state_dict(),
             "critic": self.critic.state_dict(),
             "optimiser": self.optimiser.state_dict(),
-            "replay": self.replay.state_dict() if len(self.replay) else None,
+            "experience": self.experience.state_dict(),
             "collection": self.collection.state_dict(),
             "noise": self.policy.noise.state(),
             "last_return": self._last_return,
@@ -213,8 +207,7 @@ class ActorCritic:
         self.policy.load_state_dict(state["policy"])
         self.critic.load_state_dict(state["critic"])
         self.optimiser.load_state_dict(state["optimiser"])
-        if state["replay"] is not None:
-            self.replay.load_state_dict(state["replay"])
+        self.experience.load_state_dict(state["experience"])
         self.collection.load_state_dict(state["collection"])
         self.policy.noise.restore(state["noise"])  # last: loading a collection tries the policy
         self._last_return = state["last_return"]

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -19,6 +19,7 @@ from torch_gprl.critics.planned_value import IMAGINED_STEPS, PlannedValue
 from torch_gprl.critics.transition_model import TransitionModel, Transitions
 from torch_gprl.learners.collecting import Collection, batch_of, mean_return
 from torch_gprl.learners.dynamic_programming_config import DynamicProgrammingConfig
+from torch_gprl.learners.experience import Experience
 from torch_gprl.learners.q_learning import action_box_of
 from torch_gprl.policies.gaussian import explores
 from torch_gprl.policies.streams import NoiseStream, learner_generators, stacked_normal
@@ -107,7 +108,7 @@ class DynamicProgramming:
         self.updates = 0
         self._centre, self._half = (low + high) / 2, (high - low) / 2
         self._imagination = learner_generators(seed, indices, "weights")
-        self._experience: Transitions | None = None
+        self.experience = Experience(self.total_updates * self.frames_per_update)
         self._planned, self._fitted = 0, 0  # steps of experience at the last plan and the last fit
         self._last_return = torch.full((self.learners,), torch.nan, device=env.device)
 
@@ -122,7 +123,7 @@ class DynamicProgramming:
             rollout = self.collection.rollout()
             new = self._transitions(rollout)
             error = self._surprise(new)
-            self._remember(new)
+            self.experience.extend(TensorDict(new._asdict(), new.reward.shape))
             self._plan()
             self.updates += 1
             yield self._figures(rollout) | {"model_error": error}
@@ -143,20 +144,17 @@ class DynamicProgramming:
             flat(following.get("terminated")).squeeze(-1),
         )
 
-    def _remember(self, new: Transitions) -> None:
-        old = self._experience
-        if old is not None:
-            new = Transitions(*(torch.cat(pair, 1) for pair in zip(old, new, strict=True)))
-        self._experience = new
+    def _remembered(self, steps: int) -> Transitions:
+        """The first so many steps of the experience."""
+        stored = self.experience.all()
+        return Transitions(*(stored.get(name)[:, :steps].to(self._half) for name in Transitions._fields))
 
     def _plan(self) -> None:
         """Learn the model and plan, if the experience has grown enough."""
-        data, config = self._experience, self.config
-        assert data is not None
-        steps = data.reward.shape[1]
+        steps, config = len(self.experience), self.config
         if steps < config.first_steps or steps < (1 + config.growth) * self._planned:
             return
-        fit = steps >= REFIT_GROWTH * self._fitted
+        data, fit = self._remembered(steps), steps >= REFIT_GROWTH * self._fitted
         self.model.solve(data, fit)
         self._planned, self._fitted = steps, steps if fit else self._fitted
         columns = 1 + IMAGINED_STEPS * len(self._half)
@@ -180,7 +178,7 @@ class DynamicProgramming:
             "updates": self.updates,
             "planned": self._planned,
             "fitted": self._fitted,
-            "experience": None if self._experience is None else self._experience._asdict(),
+            "experience": self.experience.state_dict(),
             "model": self.model.state_dict(),
             "plan": self.critic.state_dict(),
             "imagination": torch.stack([generator.get_state() for generator in self._imagination]),
@@ -193,12 +191,11 @@ class DynamicProgramming:
         """Take up what `state_dict` gave."""
         self.updates, self._planned, self._fitted = state["updates"], state["planned"], state["fitted"]
         self.model.load_state_dict(state["model"])
-        if state["experience"] is not None:
-            self._experience = Transitions(**state["experience"])
-            planned_on = Transitions(*(values[:, : self._planned] for values in self._experience))
-            if self._planned:
-                self.model.solve(planned_on, fit=False)
-                self.critic.load_state_dict(state["plan"], planned_on)
+        self.experience.load_state_dict(state["experience"])
+        if self._planned:
+            planned_on = self._remembered(self._planned)
+            self.model.solve(planned_on, fit=False)
+            self.critic.load_state_dict(state["plan"], planned_on)
         for generator, saved in zip(self._imagination, state["imagination"], strict=True):
             generator.set_state(saved.clone())
         self.collection.load_state_dict(state["collection"])

@@ -89,6 +89,8 @@ class NeuralTeacher:
         critic: what is taught.
     """
 
+    experience = None  # each rollout serves once
+
     def __init__(self, critic: NeuralValue) -> None:
         self.critic = critic
         self.optimiser = torch.optim.Adam(critic.parameters(), lr=LEARNING_RATE)

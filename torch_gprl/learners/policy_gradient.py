@@ -21,6 +21,7 @@ from torchrl.envs import EnvBase
 from torch_gprl.critics import USE_ALL_ACTIONS, Evaluation, GPActionValue, GPValueEstimator
 from torch_gprl.learners.collecting import Collection, batch_of, mean_return
 from torch_gprl.learners.config import GUIDED, PolicyGradientConfig
+from torch_gprl.learners.experience import Experience
 from torch_gprl.learners.neural_value import NeuralTeacher, NeuralValue
 from torch_gprl.learners.teaching import Teacher, make_critic
 from torch_gprl.objectives import (
@@ -126,6 +127,11 @@ class PolicyGradient:
 
     def _trained(self) -> list[torch.nn.Parameter]:
         return [parameter for parameter in self.policy.parameters() if parameter.requires_grad]
+
+    @property
+    def experience(self) -> Experience | None:
+        """What the critic is taught anew from, if it is."""
+        return self.teacher.experience
 
     @property
     def frames(self) -> int:

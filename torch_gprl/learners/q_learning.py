@@ -20,6 +20,7 @@ from torch_gprl.critics.maximise import ActionMaximiser
 from torch_gprl.gp import SparseOnlineGP
 from torch_gprl.kernels import Columns, Kernel, Matern, SquaredExponential
 from torch_gprl.learners.collecting import Collection, batch_of, mean_return
+from torch_gprl.learners.experience import Experience
 from torch_gprl.learners.q_learning_config import QLearningConfig
 from torch_gprl.learners.q_targets import FittedQ, OnlineQ
 from torch_gprl.policies import BehaviourPolicy
@@ -57,6 +58,11 @@ class QLearning:
         self.total_updates = -(-config.total_frames // self.frames_per_update)
         self.updates = 0
         self._last_return = torch.full((self.learners,), torch.nan, device=env.device)
+
+    @property
+    def experience(self) -> Experience | None:
+        """What the critic is taught anew from, if it is."""
+        return self.teacher.experience
 
     @property
     def frames(self) -> int:

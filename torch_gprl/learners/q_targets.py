@@ -20,11 +20,11 @@ import torch
 from jaxtyping import Bool, Float
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torch_gprl.critics import GPActionValue, k_step_returns
 from torch_gprl.critics.maximise import ActionMaximiser
 from torch_gprl.gp import SparseOnlineGP
+from torch_gprl.learners.experience import Experience
 from torch_gprl.learners.q_learning_config import QLearningConfig
 from torch_gprl.linalg import cholesky
 
@@ -49,6 +49,8 @@ class OnlineQ:
         maximiser: of the critic.
         config: discount, horizon, learning rate.
     """
+
+    experience = None  # each rollout serves once
 
     def __init__(self, critic: GPActionValue, maximiser: ActionMaximiser, config: QLearningConfig) -> None:
         self.critic, self.maximiser, self.config = critic, maximiser, config
@@ -137,7 +139,7 @@ class FittedQ:
 
     def __init__(self, critic: GPActionValue, maximiser: ActionMaximiser, config: QLearningConfig) -> None:
         self.critic, self.maximiser, self.config = critic, maximiser, config
-        self.replay = TensorDictReplayBuffer(storage=LazyTensorStorage(config.total_frames))
+        self.experience = Experience(config.total_frames)
         self.solved = self.renewed = 0  # transitions of each learner at the last solution, and renewal
 
     @property
@@ -148,9 +150,8 @@ class FittedQ:
     @torch.no_grad()
     def learn(self, rollout: TensorDictBase) -> None:
         """Remember a rollout [learners, envs, T], and solve if experience has grown enough."""
-        steps = rollout.select(*REMEMBERED).reshape(rollout.shape[0], -1)
-        self.replay.extend(steps.transpose(0, 1))
-        if len(self.replay) > self.solved * (1 + self.config.growth):
+        self.experience.extend(rollout.select(*REMEMBERED).reshape(rollout.shape[0], -1))
+        if len(self.experience) > self.solved * (1 + self.config.growth):
             self.solve()
 
     @torch.no_grad()
@@ -158,7 +159,7 @@ class FittedQ:
         """Bring the critic's values to the fixed point of y = r + γ max_a Q(s', a)."""
         data, gp = self._remembered(), self.critic.gp
         target = self._first_targets(data)
-        if len(self.replay) > self.renewed * RENEWAL:
+        if len(self.experience) > self.renewed * RENEWAL:
             self._renew(data)
         self._scale(data, target)
         inputs = self.critic.inputs(data.observation, data.action)
@@ -169,12 +170,10 @@ class FittedQ:
         gp.forget()
         gp.update(inputs, self._standard(target))
         gp.novelty_threshold = threshold
-        self.solved = len(self.replay)
+        self.solved = len(self.experience)
 
     def _remembered(self) -> Transitions:
-        stored = self.replay[:]
-        assert isinstance(stored, TensorDictBase)
-        stored, like = stored.transpose(0, 1), self.critic.input_loc
+        stored, like = self.experience.all(), self.critic.input_loc
         following, observation = stored.get("next"), stored.get("observation")
         done = following.get("done").squeeze(-1)
         joined = (following.get("observation")[:, :-1] == observation[:, 1:]).all(-1) & ~done[:, :-1]
@@ -211,7 +210,7 @@ class FittedQ:
         critic.input_scale[:, :-actions] = torch.where(std > 1e-6, std, 1.0)
         critic.input_loc[:, -actions:] = (box.high + box.low) / 2
         critic.input_scale[:, -actions:] = (box.high - box.low) / 2
-        self.renewed = len(self.replay)
+        self.renewed = len(self.experience)
 
     def _scale(self, data: Transitions, target: Tensor) -> None:
         """The prior: where nothing is known the value is `optimism` deviations above the mean."""
@@ -248,7 +247,7 @@ class FittedQ:
         """Critic and experience."""
         return {
             "critic": self.critic.state_dict(),
-            "replay": self.replay.state_dict() if len(self.replay) else None,
+            "experience": self.experience.state_dict(),
             "solved": self.solved,
             "renewed": self.renewed,
         }
@@ -256,6 +255,5 @@ class FittedQ:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what `state_dict` gave."""
         self.critic.load_state_dict(state["critic"])
-        if state["replay"] is not None:
-            self.replay.load_state_dict(state["replay"])
+        self.experience.load_state_dict(state["experience"])
         self.solved, self.renewed = state["solved"], state["renewed"]

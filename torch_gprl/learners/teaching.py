@@ -12,7 +12,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torch_gprl.critics import (
     GPActionValue,
@@ -24,6 +23,7 @@ from torch_gprl.critics import (
 )
 from torch_gprl.gp import AgeAwareScore, InformationScore, SparseOnlineGP, fit_hyperparameters
 from torch_gprl.learners.config import PolicyGradientConfig
+from torch_gprl.learners.experience import Experience
 from torch_gprl.policies import GaussianPolicy
 
 FIT_POINTS = 160  # points of a rollout that a fit of hyper-parameters sees; its cost is cubic in them
@@ -73,9 +73,7 @@ class Teacher:
     def __init__(self, critic: GPActionValue, policy: GaussianPolicy, config: PolicyGradientConfig) -> None:
         self.critic, self.config = critic, config
         self.policy: ProbabilisticTensorDictSequential = policy
-        self.replay: TensorDictReplayBuffer | None = None
-        if config.replay:
-            self.replay = TensorDictReplayBuffer(storage=LazyTensorStorage(config.replay))
+        self.experience = Experience(config.replay) if config.replay else None
 
     def teach(self, rollout: TensorDictBase, update: int) -> None:
         """Absorb a rollout that carries `value_target`, [learners, envs, T], made at policy update `update`.
@@ -89,17 +87,17 @@ class Teacher:
         store_transitions(self.critic, rollout)
         if config.targets == "returns":
             self.critic.update(rollout, stamp=update)
-        elif self.replay is None:
+        elif self.experience is None:
             self.critic.update_differences(rollout, self.policy, config.discount, stamp=update)
         else:
-            self.replay.extend(rollout.select(*REMEMBERED).reshape(rollout.shape[0], -1).transpose(0, 1))
+            self.experience.extend(rollout.select(*REMEMBERED).reshape(rollout.shape[0], -1))
             self.solve_anew(update)
         follow_basis(self.critic)
 
     def solve_anew(self, update: int) -> TensorDictBase:
         """Solve the differences of the replay under today's policy; returns it [learners, 1, steps]."""
-        assert self.replay is not None
-        remembered = self._remembered(self.replay)
+        assert self.experience is not None
+        remembered = self.experience.all()
         self.critic.resolve(remembered, self.policy, self.config.discount, stamp=update)
         return remembered.unsqueeze(1)
 
@@ -138,13 +136,6 @@ class Teacher:
             )
         clear_graphs(critic)
 
-    @staticmethod
-    def _remembered(replay: TensorDictReplayBuffer) -> TensorDictBase:
-        """All transitions of a buffer, [learners, steps]."""
-        stored = replay[:]
-        assert isinstance(stored, TensorDictBase)
-        return stored.transpose(0, 1)
-
     def figures(self) -> dict[str, Tensor]:
         """Basis vectors in use, and the share of them that is older than the newest experience [learners]."""
         gp = self.critic.gp
@@ -155,14 +146,14 @@ class Teacher:
         """Critic and replay."""
         return {
             "critic": self.critic.state_dict(),
-            "replay": self.replay.state_dict() if self.replay is not None and len(self.replay) else None,
+            "experience": None if self.experience is None else self.experience.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what `state_dict` gave."""
         self.critic.load_state_dict(state["critic"])
-        if self.replay is not None and state["replay"] is not None:
-            self.replay.load_state_dict(state["replay"])
+        if self.experience is not None:
+            self.experience.load_state_dict(state["experience"])
 
 
 def _spread_over(data: Tensor, count: int) -> Tensor:

@@ -222,3 +222,13 @@ def test_options_out_of_range_are_named():
         GeodesicKernel(experience, 0.9, spatial_edges=60)
     with pytest.raises(ValueError, match="lookahead must be at least 0"):
         SuccessorKernel(experience, 0.9, lookahead=-1)
+
+
+def test_leading_dimensions_beyond_the_batch_are_more_inputs_of_the_same_learners(make: Make):
+    experience = Experience(2, 60, 12, batch_shape=(2,))
+    experience.add(*trajectories(5, 8, 2))
+    kernel = make(experience)
+    x, z = (torch.randn(3, 2, 4, 2, dtype=torch.float64) for _ in range(2))
+    found = kernel(x, z)
+    for row in range(3):
+        torch.testing.assert_close(found[row], kernel(x[row], z[row]), rtol=0, atol=1e-12)

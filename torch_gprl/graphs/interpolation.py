@@ -7,12 +7,16 @@ nodes enter and leave. A node itself gets all weight; one neighbour is the neare
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
+from scipy.spatial import KDTree
 from torch import Tensor
 
 COINCIDENT = 1e-9  # an input this close to a node, in units of the inputs, is the node
 CHUNK = 1024  # inputs whose distances to all nodes are held at a time
+TREE_COLUMNS = 6  # up to which a tree beats comparing all distances: 17 times with 3 columns, 4 with 5
+TREE_INPUTS = 32  # from which on a tree is worth growing
 
 
 class Neighbours(NamedTuple):
@@ -42,19 +46,41 @@ def neighbours(
         count: neighbours of each input, at most C − 1.
     """
     with torch.no_grad():
-        found = [_nearest(part, nodes, used, min(count + 1, nodes.shape[-2])) for part in x.split(CHUNK, -2)]
-        index, missing = (torch.cat(parts, -2) for parts in zip(*found, strict=True))
+        small = x.shape[-1] <= TREE_COLUMNS and x.shape[-2] >= TREE_INPUTS
+        find = _nearest_by_trees if small and x.device.type == "cpu" else _nearest_of_all
+        index, missing = find(x.detach(), nodes.detach(), used, min(count + 1, nodes.shape[-2]))
     # the matrix products of cdist round nearby points apart
     distance = (x.unsqueeze(-2) - gather_rows(nodes, index)).norm(dim=-1).masked_fill(missing, torch.inf)
     near, reach = distance[..., :count], distance[..., count:]
     return Neighbours(index[..., :count], near, _shepard_weights(near, reach))
 
 
-def _nearest(x: Tensor, nodes: Tensor, used: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Indices of the nearest nodes, and which of them are not in use."""
-    rough = torch.cdist(x, nodes).masked_fill(~used.unsqueeze(-2), torch.inf)
-    values, index = rough.topk(count, dim=-1, largest=False)
-    return index, values.isinf()
+def _nearest_of_all(x: Tensor, nodes: Tensor, used: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Indices of the nearest nodes [*batch, N, count], and which of them are not in use."""
+    index, missing = [], []
+    for part in x.split(CHUNK, -2):
+        rough = torch.cdist(part, nodes).masked_fill(~used.unsqueeze(-2), torch.inf)
+        nearest = rough.topk(count, dim=-1, largest=False)
+        index.append(nearest.indices)
+        missing.append(nearest.values.isinf())
+    return torch.cat(index, -2), torch.cat(missing, -2)
+
+
+def _nearest_by_trees(x: Tensor, nodes: Tensor, used: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The same, by a tree of each learner's nodes."""
+    batch = torch.broadcast_shapes(x.shape[:-2], nodes.shape[:-2], used.shape[:-1])
+    learners = (
+        tensor.expand(*batch, *shape).reshape(-1, *shape)
+        for tensor, shape in ((x, x.shape[-2:]), (nodes, nodes.shape[-2:]), (used, used.shape[-1:]))
+    )
+    found = []
+    for points, places, mask in zip(*learners, strict=True):
+        number = mask.nonzero().squeeze(-1).numpy()
+        _, rank = KDTree(places.numpy()[number]).query(points.numpy(), count)
+        rank = rank.reshape(len(points), count)  # one neighbour comes without its dimension
+        found.append(torch.from_numpy(np.append(number, -1)[rank]))  # past the last: there is none
+    index = torch.stack(found).reshape(*batch, x.shape[-2], count)
+    return index.clamp_min(0), index < 0
 
 
 def _shepard_weights(distance: Tensor, reach: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
 Table = tuple[Tensor, ...]
 Factors = tuple[Tensor, Tensor]
 
-REMEMBERED = 4  # inputs whose features are kept: a basis, and what one step compares it with
+REMEMBERED = 8  # inputs whose features are kept: a basis, and what one step compares it with
 SMALLEST_REST = 1e-12  # of what the graph leaves open: a root of 0 has no derivative
 
 
@@ -58,7 +58,7 @@ class TableKernel(Kernel):
         sources = [*self.parameters(), *self.buffers()]
         x = x.to(sources[0].dtype)
         if torch.is_grad_enabled() and (x.requires_grad or any(source.requires_grad for source in sources)):
-            return self._build_features(x, self._build_table())
+            return self._features_of_rows(x, self._build_table())
         with torch.no_grad():
             seen = *(t._version for t in sources), *(t.data_ptr() for t in sources)
             if seen != self._table_seen:
@@ -66,11 +66,23 @@ class TableKernel(Kernel):
                 self._table_seen = seen
                 self._remembered.clear()
             for old, version, found in self._remembered:
-                if _same_memory(old, x) and version == x._version:
+                if version == old._version and (_same_memory(old, x) or torch.equal(old, x)):
                     return found
-            found = self._build_features(x, self._table)
+            found = self._features_of_rows(x, self._table)
             self._remembered.append((x, x._version, found))
             return found
+
+    def _features_of_rows(self, x: Tensor, table: Table) -> Factors:
+        """Features of x, whose leading dimensions beyond the kernel's batch are more rows of each learner."""
+        extra = x.ndim - 2 - len(self.batch_shape)
+        if extra <= 0:
+            return self._build_features(x, table)
+        rows = x.flatten(0, extra - 1).movedim(0, -3)  # [*batch, rest, N, D]
+        left, right = (
+            found.unflatten(-2, rows.shape[-3:-1]).movedim(-3, 0).unflatten(0, x.shape[:extra])
+            for found in self._build_features(rows.flatten(-3, -2), table)
+        )
+        return left, right
 
 
 class GraphKernel(TableKernel):

@@ -14,10 +14,8 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
-from torch import Tensor
 
 from envs.physics import MujocoPhysics, State
 from envs.streams import StartDraws
@@ -57,12 +55,12 @@ class Atwood(Task):
         """MuJoCo's machine under Runge-Kutta's fourth-order rule."""
         return MujocoPhysics.of_ours(MODEL, self.control_step, PHYSICS_STEP, copies, threads)
 
-    def observation(self, state: State) -> Float[Tensor, "B 5"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B 5"]:
         """(cos θ, sin θ, r in m, θ̇ in rad/s, ṙ in m/s)."""
-        θ, r = state.qpos.split(1, dim=-1)
-        return torch.cat([θ.cos(), θ.sin(), r, state.qvel], dim=-1)
+        θ, r = state.qpos[:, :1], state.qpos[:, 1:]
+        return np.concatenate([np.cos(θ), np.sin(θ), r, state.qvel], axis=-1)
 
-    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+    def terminated(self, state: State) -> Bool[np.ndarray, " B"]:
         """The length outside [0.3, 3] m."""
         r = state.qpos[:, 1]
         return (r < LENGTHS[0]) | (r > LENGTHS[1])
@@ -76,43 +74,41 @@ class Atwood(Task):
 class Swing(Atwood):
     """Keep up a swing of amplitude π/3 at length 1 m."""
 
-    def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R 2"]]:
+    def start(self, draws: StartDraws) -> tuple[Float[np.ndarray, "R 2"], Float[np.ndarray, "R 2"]]:
         """At rest: r uniform in [0.8, 1.2), θ in [−π/3, π/3)."""
         r = draws.uniform(0.8, 1.2, 1)
         θ = draws.uniform(-SWING_AMPLITUDE, SWING_AMPLITUDE, 1)
-        qpos = torch.cat([θ, r], dim=-1)
-        return qpos, torch.zeros_like(qpos)
+        qpos = np.concatenate([θ, r], axis=-1)
+        return qpos, np.zeros_like(qpos)
 
-    def reward(self, before: State, action: Float[Tensor, "B 1"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 1"], after: State) -> Reward:
         """`swing` exp(−(E/E_ref − 1)²), `length` −0.5 (r − 1)² and `effort` −0.001 u².
 
         E = ½ r² θ̇² + g r (1 − cos θ) is the swing's energy.
         """
-        θ, r = after.qpos.unbind(dim=-1)
-        energy = 0.5 * (r * after.qvel[:, 0]).square() + GRAVITY * r * (1 - θ.cos())
+        θ, r = after.qpos.T
+        energy = 0.5 * np.square(r * after.qvel[:, 0]) + GRAVITY * r * (1 - np.cos(θ))
         return Reward.of(
-            swing=torch.exp(-(energy / SWING_ENERGY - 1).square()),
-            length=(r - TARGET_LENGTH).square() * -LENGTH_WEIGHT,
-            effort=action[:, 0].square() * -EFFORT_WEIGHT,
+            swing=np.exp(-np.square(energy / SWING_ENERGY - 1)),
+            length=np.square(r - TARGET_LENGTH) * -LENGTH_WEIGHT,
+            effort=np.square(action[:, 0]) * -EFFORT_WEIGHT,
         )
 
 
 class Settle(Atwood):
     """Take in rope to length 1 m while the swing dies out."""
 
-    def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R 2"]]:
+    def start(self, draws: StartDraws) -> tuple[Float[np.ndarray, "R 2"], Float[np.ndarray, "R 2"]]:
         """At rest around θ = π/3, r = 1.5 m, uniform within ±0.1 of each."""
-        qpos = torch.tensor(SETTLE_START, dtype=torch.float64) + draws.uniform(
-            -SETTLE_SPREAD, SETTLE_SPREAD, 2
-        )
-        return qpos, torch.zeros_like(qpos)
+        qpos = SETTLE_START + draws.uniform(-SETTLE_SPREAD, SETTLE_SPREAD, 2)
+        return qpos, np.zeros_like(qpos)
 
-    def reward(self, before: State, action: Float[Tensor, "B 1"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 1"], after: State) -> Reward:
         """`settled` exp(−(r − 1)²/(2·0.3²) − θ²/(2·0.5²))."""
-        θ, r = after.qpos.unbind(dim=-1)
+        θ, r = after.qpos.T
         widths = SETTLE_WIDTHS
-        far = (θ / widths[0]).square() + ((r - TARGET_LENGTH) / widths[1]).square()
-        return Reward.of(settled=torch.exp(-0.5 * far))
+        far = np.square(θ / widths[0]) + np.square((r - TARGET_LENGTH) / widths[1])
+        return Reward.of(settled=np.exp(-0.5 * far))
 
 
 TASKS = (

@@ -5,10 +5,12 @@ can be bootstrapped at time limits.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
@@ -56,18 +58,18 @@ class BatchEnv(EnvBase):
     @property
     def qpos(self) -> Float[Tensor, "learners num_envs nq"]:
         """The generalised positions, m or rad: a copy, float64, on the CPU."""
-        return self._copies.state.qpos.clone().view(*self._shape, -1)
+        return torch.from_numpy(self._copies.state.qpos.copy()).view(*self._shape, -1)
 
     @property
     def qvel(self) -> Float[Tensor, "learners num_envs nv"]:
         """The generalised velocities, m/s or rad/s: a copy, float64, on the CPU."""
-        return self._copies.state.qvel.clone().view(*self._shape, -1)
+        return torch.from_numpy(self._copies.state.qvel.copy()).view(*self._shape, -1)
 
     def place(
         self, qpos: Float[Tensor, "learners num_envs nq"], qvel: Float[Tensor, "learners num_envs nv"]
     ) -> TensorDict:
         """Start new episodes in the given states; returns what `reset` would."""
-        self._copies.place(qpos.flatten(0, 1).cpu(), qvel.flatten(0, 1).cpu())
+        self._copies.place(qpos.flatten(0, 1).numpy(force=True), qvel.flatten(0, 1).numpy(force=True))
         return self._started()
 
     def get_extra_state(self) -> dict[str, Tensor]:
@@ -87,13 +89,16 @@ class BatchEnv(EnvBase):
     def _place_outputs(self) -> None:
         self._to = (self.device, self.options.dtype)
         self._on_host = self._to[0].type == "cpu"  # a cast to where a tensor already is costs microseconds
+        self._kind = torch.empty(0, dtype=self._to[1]).numpy().dtype
 
     def _make_specs(self) -> None:
         """Read the observation's size and the reward's parts off a trial state."""
         shape, copies = self._shape, self._copies
         kind = {"device": self._to[0], "dtype": self._to[1]}
         size = self.task.observation(copies.state).shape[-1]
-        parts = self.task.reward(copies.state, copies.low.expand(copies.size, -1), copies.state).parts
+        parts = self.task.reward(
+            copies.state, np.broadcast_to(copies.low, (copies.size, len(copies.low))), copies.state
+        ).parts
         one = torch.Size([*shape, 1])
         self._parts = tuple(parts) if self.options.info else ()
         # Of outputs, by their number of dimensions in `Copies`.
@@ -102,7 +107,7 @@ class BatchEnv(EnvBase):
         if self._parts:
             info = {name: Unbounded(one, **kind) for name in parts}
             self.observation_spec["info"] = Composite(info, shape=shape)
-        low, high = (bound.to(*self._to).expand(*shape, -1) for bound in (copies.low, copies.high))
+        low, high = (torch.tensor(bound, **kind).expand(*shape, -1) for bound in (copies.low, copies.high))
         self._action_shape = low.shape
         self.action_spec = Bounded(low, high, shape=low.shape, **kind)
         self.reward_spec = Unbounded(one, **kind)
@@ -139,9 +144,9 @@ class BatchEnv(EnvBase):
         out: dict[str, Tensor | TensorDictBase] = {
             "observation": self._out(observation),
             "reward": self._out(reward),
-            "terminated": self._flag(terminated),
-            "truncated": self._flag(truncated),
-            "done": self._flag(terminated | truncated),
+            "terminated": self._tensor(terminated),
+            "truncated": self._tensor(truncated),
+            "done": self._tensor(terminated | truncated),
         }
         if self._parts:
             out["info"] = TensorDict({name: self._out(parts[name]) for name in self._parts}, self._shape)
@@ -170,8 +175,8 @@ class BatchEnv(EnvBase):
         """Nothing: TorchRL completes and reshapes entries here, and `_step` leaves none to mend."""
         return next_tensordict_out
 
-    def _command(self, tensordict: TensorDictBase) -> Tensor:
-        """The action as [B, da] on the CPU.
+    def _command(self, tensordict: TensorDictBase) -> Float[np.ndarray, "B da"]:
+        """The action for `Copies`.
 
         Raises:
             ValueError: if its shape is wrong or an entry is not finite.
@@ -182,10 +187,8 @@ class BatchEnv(EnvBase):
                 f"action must be [learners, num_envs, action size] = {list(self._action_shape)}, "
                 f"not {list(action.shape)}"
             )
-        if action.requires_grad:
-            action = action.detach()
-        flat = action.cpu().flatten(0, 1)
-        if math.isfinite(flat.sum().item()):  # the quick proof that all entries are
+        flat = action.numpy(force=True).reshape(self._copies.size, -1)
+        if math.isfinite(flat.sum()):  # the quick proof that all entries are
             return flat
         bad = (~action.isfinite()).nonzero().tolist()
         if bad:
@@ -196,15 +199,14 @@ class BatchEnv(EnvBase):
             )
         return flat
 
-    def _out(self, value: Tensor) -> Tensor:
+    def _out(self, value: NDArray[np.floating]) -> Tensor:
         """Numbers [B] or [B, n] as `[learners, num_envs, 1 or n]` in the output's dtype, on its device."""
-        value = value.view(self._shapes[value.ndim]).to(self._to[1])
-        return value if self._on_host else value.to(self._to[0])
+        return self._tensor(value.astype(self._kind, copy=False))
 
-    def _flag(self, value: Tensor) -> Tensor:
-        """Flags [B] as `[learners, num_envs, 1]` on the output's device."""
-        value = value.view(self._shapes[1])
-        return value if self._on_host else value.to(self._to[0])
+    def _tensor(self, value: NDArray[Any]) -> Tensor:
+        """Numbers or flags [B] or [B, n] as `[learners, num_envs, 1 or n]` on the output's device."""
+        tensor = torch.from_numpy(value.reshape(self._shapes[value.ndim]))
+        return tensor if self._on_host else tensor.to(self._to[0])
 
     def render(
         self, learner: int = 0, env: int = 0, width: int = 480, height: int = 480

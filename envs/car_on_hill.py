@@ -132,27 +132,27 @@ class CarOnHill(Task):
         """The equation of motion in torch; `threads` is not used."""
         return TorchPhysics(transition, copies, (1, 1, 1))
 
-    def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]]:
+    def start(self, draws: StartDraws) -> tuple[Float[np.ndarray, "R 1"], Float[np.ndarray, "R 1"]]:
         """At rest: p uniform in [−0.1, 0.1)."""
         p = draws.uniform(-START, START, 1)
-        return p, torch.zeros_like(p)
+        return p, np.zeros_like(p)
 
-    def observation(self, state: State) -> Float[Tensor, "B 2"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B 2"]:
         """(p in m, s in m/s)."""
-        return torch.cat([state.qpos, state.qvel], dim=-1)
+        return np.concatenate([state.qpos, state.qvel], axis=-1)
 
-    def reward(self, before: State, action: Float[Tensor, "B 1"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 1"], after: State) -> Reward:
         """`goal` +1 beyond p = 1 with |s| ≤ 3; `crash` −1 beyond p = −1 or with |s| > 3."""
         p, s = after.qpos[:, 0], after.qvel[:, 0]
-        too_fast = s.abs() > TOP_SPEED
+        too_fast = np.abs(s) > TOP_SPEED
         return Reward.of(
-            goal=((p > ROAD) & ~too_fast).double(),
-            crash=-((p < -ROAD) | too_fast).double(),
+            goal=((p > ROAD) & ~too_fast).astype(np.float64),
+            crash=-((p < -ROAD) | too_fast).astype(np.float64),
         )
 
-    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+    def terminated(self, state: State) -> Bool[np.ndarray, " B"]:
         """|p| > 1 m or |s| > 3 m/s."""
-        return (state.qpos[:, 0].abs() > ROAD) | (state.qvel[:, 0].abs() > TOP_SPEED)
+        return (np.abs(state.qpos[:, 0]) > ROAD) | (np.abs(state.qvel[:, 0]) > TOP_SPEED)
 
     def pose(self, model: mujoco.MjModel, data: mujoco.MjData, qpos: NDArray[np.float64]) -> None:
         """The car on the road, level with it."""

@@ -11,9 +11,8 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
+import numpy as np
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from envs.physics import MujocoPhysics, State
 from envs.streams import StartDraws
@@ -44,49 +43,49 @@ class CartPole(Task):
         """MuJoCo's cart-pole under Runge-Kutta's fourth-order rule."""
         return MujocoPhysics.of_ours(MODEL, self.control_step, PHYSICS_STEP, copies, threads)
 
-    def observation(self, state: State) -> Float[Tensor, "B 5"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B 5"]:
         """(x in m, cos θ, sin θ, ẋ in m/s, ω in rad/s)."""
-        x, θ = state.qpos.split(1, dim=-1)
-        return torch.cat([x, θ.cos(), θ.sin(), state.qvel], dim=-1)
+        x, θ = state.qpos[:, :1], state.qpos[:, 1:]
+        return np.concatenate([x, np.cos(θ), np.sin(θ), state.qvel], axis=-1)
 
 
 class Balance(CartPole):
     """Keep the pole from falling and the cart on its rail."""
 
-    def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R 2"]]:
+    def start(self, draws: StartDraws) -> tuple[Float[np.ndarray, "R 2"], Float[np.ndarray, "R 2"]]:
         """Upright: x, θ, ẋ and ω uniform in [−0.05, 0.05)."""
-        qpos, qvel = draws.uniform(-START, START, 4).split(2, dim=-1)
-        return qpos, qvel
+        states = draws.uniform(-START, START, 4)
+        return states[:, :2], states[:, 2:]
 
-    def reward(self, before: State, action: Float[Tensor, "B 1"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 1"], after: State) -> Reward:
         """`alive`: one for each step."""
-        return Reward.of(alive=torch.ones_like(after.qpos[:, 0]))
+        return Reward.of(alive=np.ones(len(after.qpos)))
 
-    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+    def terminated(self, state: State) -> Bool[np.ndarray, " B"]:
         """|x| > 2.4 m or |θ| > 12°."""
-        return (state.qpos.abs() > torch.tensor([RAIL, BALANCE_LIMIT], dtype=torch.float64)).any(dim=-1)
+        return np.any(np.abs(state.qpos) > (RAIL, BALANCE_LIMIT), axis=-1)
 
 
 class SwingUp(CartPole):
     """Swing the hanging pole up and hold its tip above the middle of the rail."""
 
-    def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R 2"]]:
+    def start(self, draws: StartDraws) -> tuple[Float[np.ndarray, "R 2"], Float[np.ndarray, "R 2"]]:
         """Hanging: (x, θ − π, ẋ, ω) uniform in [−0.05, 0.05)."""
-        qpos, qvel = draws.uniform(-START, START, 4).split(2, dim=-1)
-        return qpos + torch.tensor([0.0, math.pi], dtype=qpos.dtype), qvel
+        states = draws.uniform(-START, START, 4)
+        return states[:, :2] + (0.0, math.pi), states[:, 2:]
 
-    def reward(self, before: State, action: Float[Tensor, "B 1"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 1"], after: State) -> Reward:
         """`tip` exp(−½‖tip − (0, 1)‖²/0.25²) and `effort` −0.001 (F/10)²."""
-        x, θ = after.qpos.unbind(dim=-1)
-        across, short = x + POLE_LENGTH * θ.sin(), POLE_LENGTH * (θ.cos() - 1)
+        x, θ = after.qpos.T
+        across, short = x + POLE_LENGTH * np.sin(θ), POLE_LENGTH * (np.cos(θ) - 1)
         return Reward.of(
-            tip=torch.exp((across.square() + short.square()) / (-2 * TIP_WIDTH**2)),
-            effort=action[:, 0].square() * (-EFFORT_WEIGHT / MAX_FORCE**2),
+            tip=np.exp((np.square(across) + np.square(short)) / (-2 * TIP_WIDTH**2)),
+            effort=np.square(action[:, 0]) * (-EFFORT_WEIGHT / MAX_FORCE**2),
         )
 
-    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+    def terminated(self, state: State) -> Bool[np.ndarray, " B"]:
         """|x| > 2.4 m."""
-        return state.qpos[:, 0].abs() > RAIL
+        return np.abs(state.qpos[:, 0]) > RAIL
 
 
 TASKS = (

@@ -1,6 +1,6 @@
 """Copies of a task, stepped together: the part that TorchRL's and Gymnasium's interfaces share.
 
-Everything here is flat: B copies over the simulator's one array, float64, on the CPU.
+Everything here is flat: B copies over the simulator's one NumPy array, float64.
 """
 
 import math
@@ -25,6 +25,7 @@ NOISE_BLOCKS = {
     "velocity": 2 << 14,
     "observation": 3 << 14,
 }  # room for 32,768 numbers each
+DTYPES = (torch.float64, torch.float32, torch.float16)  # those that NumPy has too
 LONGEST_HORIZON = 2**32 - 1  # steps that the random numbers' addresses have room for
 COPIES_PER_THREAD = 64  # fewer copies than this are not worth waking another thread for
 
@@ -59,6 +60,8 @@ class Options:
                 raise ValueError(f"{name} must be at least {least}, not {value}")
         if self.horizon is not None and self.horizon > LONGEST_HORIZON:
             raise ValueError(f"horizon must be at most {LONGEST_HORIZON}, not {self.horizon}")
+        if self.dtype not in DTYPES:
+            raise ValueError(f"dtype must be one of {', '.join(map(str, DTYPES))}, not {self.dtype}")
         for name in ("observation_noise", "action_noise", "velocity_noise"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < math.inf:
@@ -68,11 +71,11 @@ class Options:
 class Step(NamedTuple):
     """The outcome of a step, all [B] or [B, do]."""
 
-    observation: Tensor
-    reward: Tensor
-    parts: dict[str, Tensor]
-    terminated: Tensor
-    truncated: Tensor
+    observation: NDArray[np.float64]
+    reward: NDArray[np.floating]
+    parts: dict[str, NDArray[np.floating]]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
 
 
 class Copies:
@@ -92,10 +95,8 @@ class Copies:
         self.task, self.options = task, options
         self.size = options.learners * options.num_envs
         self.all = np.arange(self.size)
-        self.low = torch.tensor(task.action_low, dtype=torch.float64)
-        self.high = torch.tensor(task.action_high, dtype=torch.float64)
-        self._steps = torch.zeros(self.size, dtype=torch.int64)
-        self.steps = self._steps.numpy()
+        self.low, self.high = np.array(task.action_low), np.array(task.action_high)
+        self.steps = np.zeros(self.size, dtype=np.int64)
         self.divergences = 0
         self._horizon = task.horizon if options.horizon is None else options.horizon
         self._physics = task.physics(self.size, _threads(options.threads, self.size))
@@ -107,7 +108,7 @@ class Copies:
         options = self.options
         self._streams = Streams(seed, options.learners, options.num_envs, options.first_learner)
         widths = {
-            "action": self.low.numel(),
+            "action": self.low.size,
             "velocity": self.state.qvel.shape[1],
             "observation": self.task.observation(self.state).shape[1],
         }
@@ -128,16 +129,16 @@ class Copies:
         for noise in self._noise.values():
             noise.start(rows)
 
-    def place(self, qpos: Float[Tensor, "B nq"], qvel: Float[Tensor, "B nv"]) -> None:
+    def place(self, qpos: Float[np.ndarray, "B nq"], qvel: Float[np.ndarray, "B nv"]) -> None:
         """Start new episodes of all copies in the given states."""
         self.reset(self.all)
         self._physics.place(self.all, qpos, qvel)
 
     def save(self) -> dict[str, Tensor]:
         """All that the future depends on, as copies."""
-        steps = torch.from_numpy(self.steps.copy())
-        derived = {f"derived {name}": value.clone() for name, value in self.state.derived.items()}
-        return {"physics": self._physics.rows.clone(), "steps": steps, **derived, **self._streams.save()}
+        live = {"physics": self._physics.rows, "steps": self.steps}
+        live |= {f"derived {name}": value for name, value in self.state.derived.items()}
+        return {name: torch.from_numpy(value.copy()) for name, value in live.items()} | self._streams.save()
 
     def load(self, saved: dict[str, Tensor]) -> None:
         """Go on from what `save` gave, bit for bit.
@@ -150,36 +151,36 @@ class Copies:
                 f"the saved environment has {list(saved['physics'].shape)} numbers (copies, state), this one "
                 f"{list(self._physics.rows.shape)}; make it with the same task, learners and num_envs"
             )
-        self._physics.rows.copy_(saved["physics"])
+        self._physics.rows[:] = saved["physics"].numpy()
         for name, value in self.state.derived.items():
-            value.copy_(saved[f"derived {name}"])
+            value[:] = saved[f"derived {name}"].numpy()
         self.steps[:] = saved["steps"].numpy()
         self._streams.load(saved)
         for noise in self._noise.values():
             noise.resume(self.steps)
 
-    def observation(self) -> Float[Tensor, "B do"]:
+    def observation(self) -> Float[np.ndarray, "B do"]:
         """What the agent sees of the present state."""
         observation = self.task.observation(self.state)
         if "observation" in self._noise:
             observation += self._noise["observation"].now
         return observation
 
-    def step(self, action: Float[Tensor, "B da"]) -> Step:
+    def step(self, action: Float[np.ndarray, "B da"]) -> Step:
         """Advance every copy by one control step.
 
         Args:
             action: [B, da] finite commands in the actuators' units; noise is added, then they are clipped.
         """
-        self._steps += 1
+        self.steps += 1
         for noise in self._noise.values():
             noise.advance(self.steps)
         if "action" in self._noise:
             action = action + self._noise["action"].now
-        applied = torch.clamp(action, self.low, self.high, out=self._physics.control)
+        applied = action.clip(self.low, self.high, out=self._physics.control)
         before = self._physics.advance()
         if "velocity" in self._noise:
-            self.state.qvel.add_(self._noise["velocity"].now)
+            np.add(self.state.qvel, self._noise["velocity"].now, out=self.state.qvel)
         divergence = self._physics.diverged()
         if divergence is not None:
             self._undo(divergence)
@@ -187,12 +188,12 @@ class Copies:
         terminated = self.task.terminated(self.state)
         if divergence is not None:
             terminated = terminated | divergence.copies
-        return Step(self.observation(), reward, parts, terminated, self._steps >= self._horizon)
+        return Step(self.observation(), reward, parts, terminated, self.steps >= self._horizon)
 
     def _undo(self, divergence: Divergence) -> None:
         """Put lost simulations back into their last good state, count them, and warn of the first."""
         if not self.divergences:
-            learner, env = divmod(int(divergence.copies.int().argmax()), self.options.num_envs)
+            learner, env = divmod(int(divergence.copies.argmax()), self.options.num_envs)
             warnings.warn(
                 f"{self.task.id}: the simulation of learner {learner}, environment {env} diverged with "
                 f"{divergence.reason}; such episodes end as terminated and are counted in `divergences`. "

@@ -10,9 +10,8 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
+import numpy as np
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from envs.physics import MujocoPhysics, State
 from envs.streams import StartDraws
@@ -41,27 +40,27 @@ class Crane(Task):
         """MuJoCo's crane under Runge-Kutta's fourth-order rule."""
         return MujocoPhysics.of_ours(MODEL, self.control_step, PHYSICS_STEP, copies, threads)
 
-    def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R 2"]]:
+    def start(self, draws: StartDraws) -> tuple[Float[np.ndarray, "R 2"], Float[np.ndarray, "R 2"]]:
         """At rest with a still load: x uniform in [−1.1, −0.9)."""
         x = START + draws.uniform(-START_SPREAD, START_SPREAD, 1)
-        qpos = torch.cat([x, torch.zeros_like(x)], dim=-1)
-        return qpos, torch.zeros_like(qpos)
+        qpos = np.concatenate([x, np.zeros_like(x)], axis=-1)
+        return qpos, np.zeros_like(qpos)
 
-    def observation(self, state: State) -> Float[Tensor, "B 5"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B 5"]:
         """(x − goal in m, cos θ, sin θ, ẋ in m/s, ω in rad/s)."""
-        x, θ = state.qpos.split(1, dim=-1)
-        return torch.cat([x - GOAL, θ.cos(), θ.sin(), state.qvel], dim=-1)
+        x, θ = state.qpos[:, :1], state.qpos[:, 1:]
+        return np.concatenate([x - GOAL, np.cos(θ), np.sin(θ), state.qvel], axis=-1)
 
-    def reward(self, before: State, action: Float[Tensor, "B 1"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 1"], after: State) -> Reward:
         """−(e² + 0.5 θ² + 0.1 ω² + 0.05 ẋ² + 0.001 F²), e the load's distance to the goal along the rail."""
-        (x, θ), (speed, ω) = after.qpos.unbind(dim=-1), after.qvel.unbind(dim=-1)
-        e = x + ROPE * θ.sin() - GOAL
+        (x, θ), (speed, ω) = after.qpos.T, after.qvel.T
+        e = x + ROPE * np.sin(θ) - GOAL
         errors = {"distance": e, "swing": θ, "swing_rate": ω, "speed": speed, "effort": action[:, 0]}
-        return Reward.of(**{name: error.square() * -WEIGHTS[name] for name, error in errors.items()})
+        return Reward.of(**{name: np.square(error) * -WEIGHTS[name] for name, error in errors.items()})
 
-    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+    def terminated(self, state: State) -> Bool[np.ndarray, " B"]:
         """|x| > 1.6 m or |θ| > π/2."""
-        return (state.qpos.abs() > torch.tensor([RAIL, SWING_LIMIT], dtype=torch.float64)).any(dim=-1)
+        return np.any(np.abs(state.qpos) > (RAIL, SWING_LIMIT), axis=-1)
 
 
 TASKS = (Crane(id="crane", horizon=200, control_step=0.05, noise=Noise(velocity=0.01)),)

@@ -9,7 +9,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -43,10 +42,10 @@ def apply(copies: Copies, actions: NDArray[Any]) -> Step:
     Raises:
         ValueError: if the shape is wrong or an entry is not finite.
     """
-    expected = (copies.size, copies.low.numel())
+    expected = (copies.size, copies.low.size)
     if actions.shape != expected or not np.isfinite(actions).all():
         raise ValueError(f"actions must be finite and of shape {expected}, not {actions.shape}: {actions}")
-    shares = torch.from_numpy(np.asarray(actions, dtype=np.float64))
+    shares = np.asarray(actions, dtype=np.float64)
     return copies.step((copies.high + copies.low) / 2 + shares * (copies.high - copies.low) / 2)
 
 
@@ -85,19 +84,19 @@ class SingleEnv(gymnasium.Env[Floats, Floats]):
         if seed is not None or fresh:
             self._copies.seed(int(self.np_random.integers(SEEDS)) if seed is None else seed)
         self._copies.reset(self._copies.all)
-        return self._copies.observation()[0].float().numpy(), {}
+        return self._copies.observation()[0].astype(np.float32), {}
 
     def step(self, action: NDArray[Any]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """One control step; `info` holds the parts of the reward."""
         observation, reward, parts, terminated, _ = apply(self._copies, np.asarray(action)[None])
         info = {f"reward_{name}": part.item() for name, part in parts.items()}
-        return observation[0].float().numpy(), reward.item(), bool(terminated.item()), False, info
+        return observation[0].astype(np.float32), reward.item(), bool(terminated.item()), False, info
 
     def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """A frame [480, 480, 3], if the render mode asks for one."""
         if self.render_mode is None:
             return None
-        return self._pictures.frame(self._copies.state.qpos[0].numpy())
+        return self._pictures.frame(self._copies.state.qpos[0])
 
 
 class VectorEnv(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[Any]]):
@@ -152,7 +151,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[Any]]):
             rows = np.flatnonzero(options["reset_mask"])
         self._copies.reset(rows)
         self._done[rows] = False
-        return self._copies.observation().float().numpy(), {}
+        return self._copies.observation().astype(np.float32), {}
 
     def step(
         self, actions: NDArray[Any]
@@ -161,15 +160,15 @@ class VectorEnv(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[Any]]):
     ]:
         """One control step of all; `infos` holds the parts of the rewards, [num_envs]."""
         observation, reward, parts, terminated, truncated = apply(self._copies, np.asarray(actions))
-        infos = {f"reward_{name}": part.double().numpy() for name, part in parts.items()}
-        results = reward.numpy(), terminated.numpy(), truncated.numpy()
+        infos = {f"reward_{name}": part.astype(np.float64) for name, part in parts.items()}
+        results = reward.astype(np.float64), terminated, truncated
         if self._done.any():
             self._copies.reset(np.flatnonzero(self._done))
             observation = self._copies.observation()
             for values in (*results, *infos.values()):
                 values[self._done] = 0
         self._done = results[1] | results[2]
-        return observation.float().numpy(), *results, infos
+        return observation.astype(np.float32), *results, infos
 
 
 def _task(task_id: str, noise: Noise | None) -> Task:

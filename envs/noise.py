@@ -5,9 +5,7 @@ of the next `AHEAD` steps of all environments is kept, and a step only moves on 
 """
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from envs.streams import Streams
 
@@ -30,10 +28,9 @@ class StepNoise:
     def __init__(self, streams: Streams, std: float, size: int, block: int) -> None:
         self._streams, self._std, self._block = streams, std, block
         self._all = np.arange(len(streams.episode))
-        self._ahead = torch.zeros(AHEAD, len(self._all), size, dtype=torch.float64)
-        self._slices: list[Tensor] = list(self._ahead.unbind())
+        self._ahead = np.zeros((AHEAD, len(self._all), size))
         self._slot = AHEAD - 1
-        self.now = self._slices[self._slot]
+        self.now = self._ahead[self._slot]
 
     def start(self, rows: NDArray[np.intp]) -> None:
         """Environments `rows` [R] begin a new episode: they are at step 0 of it now."""
@@ -48,18 +45,16 @@ class StepNoise:
         self._slot += 1
         if self._slot == AHEAD:
             self.resume(steps)
-        self.now = self._slices[self._slot]
+        self.now = self._ahead[self._slot]
 
     def resume(self, steps: NDArray[np.int64]) -> None:
         """All environments are at `steps` [B] of their episodes, wherever they were before."""
         self._slot = 0
         self._fill(self._all, steps)
-        self.now = self._slices[0]
+        self.now = self._ahead[0]
 
     def _fill(self, rows: NDArray[np.intp], steps: NDArray[np.int64]) -> None:
         """Compute the vectors of `rows` from the present slot to the last."""
         step = (steps[:, None] + np.arange(AHEAD - self._slot)).astype(np.uint64)
         values = self._streams.normal(rows, step, self._ahead.shape[-1], self._block)
-        self._ahead[self._slot :, torch.from_numpy(rows)] = torch.from_numpy(self._std * values).transpose(
-            0, 1
-        )
+        self._ahead[self._slot :, rows] = (self._std * values).swapaxes(0, 1)

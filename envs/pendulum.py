@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -27,15 +28,15 @@ BALANCE_WIDTHS = (0.3, 2.0)  # rad, rad/s: the widths of the reward's bell
 EXPLORE_WIDTHS = (0.5, 2.0)  # rad, rad/s
 
 
-def angle(state: State) -> Float[Tensor, " B"]:
+def angle(state: State) -> Float[np.ndarray, " B"]:
     """The angle from upright in [−π, π)."""
-    return torch.remainder(state.qpos[:, 0] + math.pi, 2 * math.pi) - math.pi
+    return np.remainder(state.qpos[:, 0] + math.pi, 2 * math.pi) - math.pi
 
 
-def bell(state: State, widths: tuple[float, float]) -> Float[Tensor, " B"]:
+def bell(state: State, widths: tuple[float, float]) -> Float[np.ndarray, " B"]:
     """exp(−θ²/(2 w_θ²) − ω²/(2 w_ω²)): one at rest upright, almost zero elsewhere."""
     θ, ω = angle(state), state.qvel[:, 0]
-    return torch.exp(-θ.square() / (2 * widths[0] ** 2) - ω.square() / (2 * widths[1] ** 2))
+    return np.exp(-np.square(θ) / (2 * widths[0] ** 2) - np.square(ω) / (2 * widths[1] ** 2))
 
 
 def _to_observation(points: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
@@ -71,35 +72,35 @@ class Pendulum(Task):
         """MuJoCo's pendulum under Runge-Kutta's fourth-order rule."""
         return MujocoPhysics.of_ours(MODEL, self.control_step, PHYSICS_STEP, copies, threads)
 
-    def observation(self, state: State) -> Float[Tensor, "B 3"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B 3"]:
         """(cos θ, sin θ, ω in rad/s)."""
-        return torch.cat([state.qpos.cos(), state.qpos.sin(), state.qvel], dim=-1)
+        return np.concatenate([np.cos(state.qpos), np.sin(state.qpos), state.qvel], axis=-1)
 
 
 class Hanging(Pendulum):
     """Pendulum tasks that start at rest, hanging."""
 
-    def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]]:
+    def start(self, draws: StartDraws) -> tuple[Float[np.ndarray, "R 1"], Float[np.ndarray, "R 1"]]:
         """θ ~ N(π, 0.1²), ω = 0."""
         qpos = math.pi + draws.normal(HANGING_STD, 1)
-        return qpos, torch.zeros_like(qpos)
+        return qpos, np.zeros_like(qpos)
 
 
 class SwingUp(Hanging):
     """Swing up and stay there, with little torque."""
 
-    def reward(self, before: State, action: Float[Tensor, "B 1"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 1"], after: State) -> Reward:
         """`upright` (1 + cos θ)/2 and `effort` −0.001 u²."""
         return Reward.of(
-            upright=0.5 + 0.5 * after.qpos[:, 0].cos(),
-            effort=action[:, 0].square() * -EFFORT_WEIGHT,
+            upright=0.5 + 0.5 * np.cos(after.qpos[:, 0]),
+            effort=np.square(action[:, 0]) * -EFFORT_WEIGHT,
         )
 
 
 class Explore(Hanging):
     """Swing up on a reward that is almost zero until upright: a test of exploration."""
 
-    def reward(self, before: State, action: Float[Tensor, "B 1"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 1"], after: State) -> Reward:
         """`upright` exp(−θ²/(2·0.5²) − ω²/(2·2²))."""
         return Reward.of(upright=bell(after, EXPLORE_WIDTHS))
 
@@ -107,18 +108,18 @@ class Explore(Hanging):
 class Balance(Pendulum):
     """Stay upright."""
 
-    def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]]:
+    def start(self, draws: StartDraws) -> tuple[Float[np.ndarray, "R 1"], Float[np.ndarray, "R 1"]]:
         """θ and ω uniform in [−0.2, 0.2)."""
-        qpos, qvel = draws.uniform(-BALANCE_START, BALANCE_START, 2).split(1, dim=-1)
-        return qpos, qvel
+        states = draws.uniform(-BALANCE_START, BALANCE_START, 2)
+        return states[:, :1], states[:, 1:]
 
-    def reward(self, before: State, action: Float[Tensor, "B 1"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 1"], after: State) -> Reward:
         """`upright` exp(−θ²/(2·0.3²) − ω²/(2·2²))."""
         return Reward.of(upright=bell(after, BALANCE_WIDTHS))
 
-    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+    def terminated(self, state: State) -> Bool[np.ndarray, " B"]:
         """|θ| > π/4."""
-        return angle(state).abs() > BALANCE_LIMIT
+        return np.abs(angle(state)) > BALANCE_LIMIT
 
 
 TASKS = (

@@ -1,7 +1,7 @@
 """The simulators: B copies of one system, advanced together over one shared array.
 
 MuJoCo's `Batch` steps all copies over one `(B, nstate)` float64 array, bit for bit as a loop over single
-simulations would, on any number of threads; torch views the same memory.
+simulations would, on any number of threads.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -9,7 +9,6 @@ simulations would, on any number of threads; torch views the same memory.
 
 import abc
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -33,6 +32,9 @@ BAD_STATE = {  # what makes MuJoCo reset a simulation
 }
 
 
+Floats = NDArray[np.float64]
+
+
 class State(NamedTuple):
     """The state of B simulations.
 
@@ -42,9 +44,9 @@ class State(NamedTuple):
         derived: what the task asked of the simulator beyond them, name -> [B, ...].
     """
 
-    qpos: Tensor
-    qvel: Tensor
-    derived: Mapping[str, Tensor] = {}
+    qpos: Floats
+    qvel: Floats
+    derived: Mapping[str, Floats] = {}
 
 
 class Divergence(NamedTuple):
@@ -55,7 +57,7 @@ class Divergence(NamedTuple):
         reason: what went wrong in the first of them.
     """
 
-    copies: Tensor
+    copies: NDArray[np.bool_]
     reason: str
 
 
@@ -70,11 +72,11 @@ class Physics(abc.ABC):
         control: [B, nu] float64, a live view of what acts during the next step: write to it.
     """
 
-    rows: Tensor
-    control: Tensor
-    qpos: Tensor
-    qvel: Tensor
-    derived: dict[str, Tensor]
+    rows: Floats
+    control: Floats
+    qpos: Floats
+    qvel: Floats
+    derived: dict[str, Floats]
 
     @abc.abstractmethod
     def advance(self) -> State:
@@ -85,15 +87,17 @@ class Physics(abc.ABC):
         """
 
     @abc.abstractmethod
-    def place(self, rows: NDArray[np.intp], qpos: Float[Tensor, "R nq"], qvel: Float[Tensor, "R nv"]) -> None:
-        """Put the copies `rows` into new states and forget their past."""
+    def place(
+        self, rows: NDArray[np.intp], qpos: Float[np.ndarray, "R nq"], qvel: Float[np.ndarray, "R nv"]
+    ) -> None:
+        """Put the copies `rows` [R] into new states, [R, nq] and [R, nv], and forget their past."""
 
     @abc.abstractmethod
     def diverged(self) -> Divergence | None:
         """Where and why the last step ended in no usable state, or None where all is well."""
 
     @abc.abstractmethod
-    def restore(self, rows: Bool[Tensor, " B"]) -> None:
+    def restore(self, rows: Bool[np.ndarray, " B"]) -> None:
         """Undo the last step of the copies `rows`."""
 
 
@@ -122,15 +126,15 @@ class MujocoPhysics(Physics):
         self.model = model
         self.batch = mujoco.batch.Batch(model, copies, nthread=threads, persistent=persistent)
         self.substeps = substeps
-        self.rows = torch.from_numpy(self.batch.state)
-        self._before = self.rows.clone()
+        self.rows = self.batch.state
+        self._before = self.rows.copy()
         qpos, qvel, control = (self._columns(name) for name in ("qpos", "qvel", "ctrl"))
         self.qpos, self.qvel, self.control = self.rows[:, qpos], self.rows[:, qvel], self.rows[:, control]
-        with warnings.catch_warnings():
+        self.derived = {name: self.batch.bind(name) for name in derived}
+        for value in self.derived.values():
             # MuJoCo overwrites these at each call; they are written only to go back to an earlier state.
-            warnings.filterwarnings("ignore", "The given NumPy array is not writable")
-            self.derived = {name: torch.from_numpy(self.batch.bind(name)) for name in derived}
-        self._past_derived = {name: value.clone() for name, value in self.derived.items()}
+            value.flags.writeable = True
+        self._past_derived = {name: value.copy() for name, value in self.derived.items()}
         self._past = State(self._before[:, qpos], self._before[:, qvel], self._past_derived)
 
     @classmethod
@@ -151,35 +155,35 @@ class MujocoPhysics(Physics):
 
     def advance(self) -> State:
         """Advance every copy by `substeps` physics steps; see `Physics.advance`."""
-        self._before.copy_(self.rows)
+        np.copyto(self._before, self.rows)
         for name, value in self.derived.items():
-            self._past_derived[name].copy_(value)
+            np.copyto(self._past_derived[name], value)
         self.batch.step(nstep=self.substeps)
         return self._past
 
-    def place(self, rows: NDArray[np.intp], qpos: Float[Tensor, "R nq"], qvel: Float[Tensor, "R nv"]) -> None:
+    def place(
+        self, rows: NDArray[np.intp], qpos: Float[np.ndarray, "R nq"], qvel: Float[np.ndarray, "R nv"]
+    ) -> None:
         """Reset copies and compute what follows from their new states; see `Physics.place`."""
         self.batch.reset(rows, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        index = torch.from_numpy(rows)
-        self.qpos[index] = qpos
-        self.qvel[index] = qvel
+        self.qpos[rows] = qpos
+        self.qvel[rows] = qvel
         self.batch.forward(rows)
 
     def diverged(self) -> Divergence | None:
         """Where MuJoCo had to reset a copy, or left it beyond `LARGEST`; see `Physics.diverged`."""
         # A sum of squares within the bound's square proves all entries within the bound; NaN fails the test.
-        state = self.batch.state
-        if np.vdot(state, state) <= LARGEST**2 and not np.count_nonzero(self.batch.warning):
+        if np.vdot(self.rows, self.rows) <= LARGEST**2 and not np.count_nonzero(self.batch.warning):
             return None
         lost = np.stack([self.batch.warning[:, warning, 1] > 0 for warning in BAD_STATE])
         self.batch.warning[:] = 0
-        bad = lost.any(axis=0) | ~(np.abs(state).max(axis=1) <= LARGEST)
+        bad = lost.any(axis=0) | ~(np.abs(self.rows).max(axis=1) <= LARGEST)
         if not bad.any():
             return None
         reasons = np.array(list(BAD_STATE.values()))[lost[:, bad.argmax()]]
-        return Divergence(torch.from_numpy(bad), reasons[0] if len(reasons) else TOO_LARGE)
+        return Divergence(bad, reasons[0] if len(reasons) else TOO_LARGE)
 
-    def restore(self, rows: Bool[Tensor, " B"]) -> None:
+    def restore(self, rows: Bool[np.ndarray, " B"]) -> None:
         """Put back the state before the last step; see `Physics.restore`."""
         self.rows[rows] = self._before[rows]
         for name, value in self.derived.items():
@@ -187,7 +191,7 @@ class MujocoPhysics(Physics):
 
 
 class TorchPhysics(Physics):
-    """Copies of a system given by its equations, as one batched function.
+    """Copies of a system given by its equations, as one batched function in torch.
 
     Args:
         transition: (qpos [B, nq], qvel [B, nv], control [B, nu]) -> the positions and velocities one control
@@ -203,33 +207,35 @@ class TorchPhysics(Physics):
         sizes: tuple[int, int, int],
     ) -> None:
         self._transition = transition
-        self.rows = torch.zeros(copies, sum(sizes), dtype=torch.float64)
-        self._before = self.rows.clone()
-        self.qpos, self.qvel, self.control = self.rows.split(sizes, dim=1)
-        past_qpos, past_qvel, _ = self._before.split(sizes, dim=1)
+        self.rows, self._before = np.zeros((copies, sum(sizes))), np.zeros((copies, sum(sizes)))
+        bounds = np.cumsum(sizes)[:-1]
+        self.qpos, self.qvel, self.control = np.split(self.rows, bounds, axis=1)
+        past_qpos, past_qvel, _ = np.split(self._before, bounds, axis=1)
         self._past = State(past_qpos, past_qvel)
+        self._inputs = torch.from_numpy(self._before).split(sizes, dim=1)  # the same memory
+        self._outputs = torch.from_numpy(self.rows).split(sizes, dim=1)[:2]
         self.derived = {}
 
     def advance(self) -> State:
         """Apply the transition; see `Physics.advance`."""
-        self._before.copy_(self.rows)
-        qpos, qvel = self._transition(self._past.qpos, self._past.qvel, self.control)
-        self.qpos.copy_(qpos)
-        self.qvel.copy_(qvel)
+        np.copyto(self._before, self.rows)
+        for now, new in zip(self._outputs, self._transition(*self._inputs), strict=True):
+            now.copy_(new)
         return self._past
 
-    def place(self, rows: NDArray[np.intp], qpos: Float[Tensor, "R nq"], qvel: Float[Tensor, "R nv"]) -> None:
+    def place(
+        self, rows: NDArray[np.intp], qpos: Float[np.ndarray, "R nq"], qvel: Float[np.ndarray, "R nv"]
+    ) -> None:
         """Write the states; see `Physics.place`."""
-        index = torch.from_numpy(rows)
-        self.qpos[index] = qpos
-        self.qvel[index] = qvel
+        self.qpos[rows] = qpos
+        self.qvel[rows] = qvel
 
     def diverged(self) -> Divergence | None:
         """Where a number is not finite or beyond `LARGEST`; see `Physics.diverged`."""
-        if self.rows.abs().max() <= LARGEST:  # NaN fails the test
-            return None
-        return Divergence(~(self.rows.abs().amax(dim=1) <= LARGEST), TOO_LARGE)
+        sizes = np.abs(self.rows).max(axis=1)
+        good = sizes <= LARGEST  # NaN fails the test
+        return None if good.all() else Divergence(~good, TOO_LARGE)
 
-    def restore(self, rows: Bool[Tensor, " B"]) -> None:
+    def restore(self, rows: Bool[np.ndarray, " B"]) -> None:
         """Put back the state before the last step; see `Physics.restore`."""
         self.rows[rows] = self._before[rows]

@@ -128,14 +128,14 @@ class StartDraws:
         """Gymnasium's generators of the R environments, for tasks that draw as Gymnasium does."""
         return [self._streams.generator(row) for row in self._rows.tolist()]
 
-    def uniform(self, low: float, high: float, size: int) -> Tensor:
-        """[R, size] numbers uniform in [low, high), float64."""
+    def uniform(self, low: float, high: float, size: int) -> NDArray[np.float64]:
+        """[R, size] numbers uniform in [low, high)."""
         values = self._streams.uniform(self._rows, self._step, size, self._block)
         self._block += (size + 1) // 2
-        return torch.from_numpy(low + (high - low) * values)
+        return low + (high - low) * values
 
-    def normal(self, std: float, size: int) -> Tensor:
-        """[R, size] normal numbers of standard deviation `std`, float64."""
+    def normal(self, std: float, size: int) -> NDArray[np.float64]:
+        """[R, size] normal numbers of standard deviation `std`."""
         values = self._streams.normal(self._rows, self._step, size, self._block)
         self._block += (size + 1) // 2
-        return torch.from_numpy(std * values)
+        return std * values

@@ -1,7 +1,9 @@
 """What a task is: pure batched functions of the state, and the numbers that fix the problem.
 
 A task holds no state and steps no simulator: `physics.py` moves the state, `copies.py` calls the functions
-here once a control step, `batch.py` wraps the results for TorchRL.
+here once a control step, `batch.py` wraps the results for TorchRL. The functions are NumPy's, as
+the simulator's memory is: right after MuJoCo's step, with cold caches, an operation in torch costs several
+times as much.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -16,7 +18,6 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
@@ -28,13 +29,13 @@ from envs.streams import StartDraws
 class Reward(NamedTuple):
     """A reward [B] and its named parts [B], for plots and for finding out what an agent is after."""
 
-    total: Tensor
-    parts: dict[str, Tensor]
+    total: NDArray[np.floating]
+    parts: dict[str, NDArray[np.floating]]
 
     @classmethod
-    def of(cls, **parts: Tensor) -> "Reward":
+    def of(cls, **parts: NDArray[np.floating]) -> "Reward":
         """The sum of the parts, in the order given."""
-        return cls(functools.reduce(torch.add, parts.values()), parts)
+        return cls(functools.reduce(np.add, parts.values()), parts)
 
 
 @dataclass(frozen=True)
@@ -82,21 +83,21 @@ class Task(abc.ABC):
         """A simulator of `copies` independent copies on `threads` threads."""
 
     @abc.abstractmethod
-    def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R nq"], Float[Tensor, "R nv"]]:
+    def start(self, draws: StartDraws) -> tuple[Float[np.ndarray, "R nq"], Float[np.ndarray, "R nv"]]:
         """Draw the positions and velocities that R episodes start from."""
 
     @abc.abstractmethod
-    def observation(self, state: State) -> Float[Tensor, "B do"]:
-        """What the agent sees, in a new tensor."""
+    def observation(self, state: State) -> Float[np.ndarray, "B do"]:
+        """What the agent sees, in a new array."""
 
     @abc.abstractmethod
-    def reward(self, before: State, action: Float[Tensor, "B da"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B da"], after: State) -> Reward:
         """The reward of a step, from the states around it and the action that was applied."""
 
     def pose(self, model: mujoco.MjModel, data: mujoco.MjData, qpos: NDArray[np.float64]) -> None:
         """Put positions [nq] into the model that is drawn, with whatever only the eye needs."""
         data.qpos[:] = qpos
 
-    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+    def terminated(self, state: State) -> Bool[np.ndarray, " B"]:
         """Where the episode is over for good, time limits aside; never, unless a task says otherwise."""
-        return torch.zeros(len(state.qpos), dtype=torch.bool)
+        return np.zeros(len(state.qpos), dtype=bool)

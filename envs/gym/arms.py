@@ -3,10 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from torch import Tensor
 
 from envs.gym.base import GymnasiumTask, asset, norm, shared, squares
 from envs.physics import State
@@ -20,7 +18,7 @@ class Arm(GymnasiumTask):
     start_noise: float = 0.005  # of velocities, rad/s
     derived: tuple[str, ...] = ("xpos",)
 
-    def place_of(self, body: str, state: State) -> Float[Tensor, "B 3"]:
+    def place_of(self, body: str, state: State) -> Float[np.ndarray, "B 3"]:
         """Where a body is, m."""
         return state.derived["xpos"][:, shared(self.scene).body(body).id]
 
@@ -43,14 +41,14 @@ class Reacher(Arm):
         qvel[-2:] = 0
         return qpos, qvel
 
-    def observation(self, state: State) -> Float[Tensor, "B 10"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B 10"]:
         """Cosines and sines of the joints, target, joint velocities, and the way from target to fingertip."""
-        angles = state.qpos[:, :2].numpy()
+        angles = state.qpos[:, :2]
         way = self.place_of("fingertip", state) - self.place_of("target", state)
-        joints = torch.from_numpy(np.concatenate([np.cos(angles), np.sin(angles)], axis=-1))
-        return torch.cat([joints, state.qpos[:, 2:], state.qvel[:, :2], way[:, :2]], dim=-1)
+        seen = [np.cos(angles), np.sin(angles), state.qpos[:, 2:], state.qvel[:, :2], way[:, :2]]
+        return np.concatenate(seen, axis=-1)
 
-    def reward(self, before: State, action: Float[Tensor, "B 2"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 2"], after: State) -> Reward:
         """Minus `dist` in m, minus `ctrl`."""
         distance = norm(self.place_of("fingertip", after) - self.place_of("target", after))
         return Reward.of(dist=-distance, ctrl=-squares(action))
@@ -76,12 +74,12 @@ class Pusher(Arm):
         qvel[-4:] = 0
         return qpos, qvel
 
-    def observation(self, state: State) -> Float[Tensor, "B 23"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B 23"]:
         """Positions and velocities of the joints, and where hand, cylinder and goal are."""
         places = [self.place_of(body, state) for body in ("tips_arm", "object", "goal")]
-        return torch.cat([state.qpos[:, :7], state.qvel[:, :7], *places], dim=-1)
+        return np.concatenate([state.qpos[:, :7], state.qvel[:, :7], *places], axis=-1)
 
-    def reward(self, before: State, action: Float[Tensor, "B 7"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 7"], after: State) -> Reward:
         """Minus `dist` of the cylinder from the goal, `ctrl`, and `near`: the hand from the cylinder."""
         hand, cylinder, goal = (self.place_of(body, after) for body in ("tips_arm", "object", "goal"))
         return Reward.of(

@@ -1,8 +1,8 @@
-"""What Gymnasium's MuJoCo tasks share: their models, their way to draw starts, and NumPy's way to add.
+"""What Gymnasium's MuJoCo tasks share: their models and their way to draw starts.
 
 Observations, rewards, terminations and truncations equal those of `gymnasium.make(id)` bit for bit in
-float64, which takes more than the same formulae: Gymnasium squares float32 actions in float32, and NumPy adds
-numbers in another order than torch.
+float64, which takes more than the same formulae: Gymnasium squares float32 actions in float32, and a sum of
+numbers depends on their order.
 """
 
 import functools
@@ -12,10 +12,8 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from torch import Tensor
 
 from envs.models import load
 from envs.physics import MujocoPhysics, Physics
@@ -40,20 +38,14 @@ def shared(path: Path) -> mujoco.MjModel:
     return load(path)
 
 
-def squares(action: Float[Tensor, "B da"]) -> Float[Tensor, " B"]:
-    """Σ a² in float32 and in NumPy's order, float32."""
-    return torch.from_numpy(np.add.reduce(np.square(action.float().numpy()), axis=-1))
+def squares(action: Float[np.ndarray, "B da"]) -> Float[np.ndarray, " B"]:
+    """Σ a² in float32, as Gymnasium's actions are."""
+    return np.add.reduce(np.square(action.astype(np.float32)), axis=-1)
 
 
-def numpy_sum(values: Float[Tensor, "B ..."]) -> Float[Tensor, " B"]:
-    """The sum over all but the first dimension, in NumPy's order."""
-    return torch.from_numpy(values.flatten(1).numpy().sum(axis=-1))
-
-
-def norm(vectors: Float[Tensor, "B n"]) -> Float[Tensor, " B"]:
+def norm(vectors: Float[np.ndarray, "B n"]) -> Float[np.ndarray, " B"]:
     """Lengths as `np.linalg.norm` finds them one by one, with the dot product of a BLAS."""
-    rows = vectors.numpy()
-    return torch.from_numpy(np.sqrt((rows[:, None, :] @ rows[:, :, None])[:, 0, 0]))
+    return np.sqrt((vectors[:, None, :] @ vectors[:, :, None])[:, 0, 0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,10 +64,10 @@ class GymnasiumTask(Task):
         """Gymnasium's model, as it is."""
         return MujocoPhysics(shared(self.scene), copies, self.frame_skip, threads, self.derived)
 
-    def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R nq"], Float[Tensor, "R nv"]]:
+    def start(self, draws: StartDraws) -> tuple[Float[np.ndarray, "R nq"], Float[np.ndarray, "R nv"]]:
         """The model's initial state with noise, drawn as Gymnasium draws it."""
         qpos, qvel = zip(*(self.start_one(rng) for rng in draws.generators), strict=True)
-        return torch.from_numpy(np.stack(qpos)), torch.from_numpy(np.stack(qvel))
+        return np.stack(qpos), np.stack(qvel)
 
     def start_one(self, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Positions [nq] and velocities [nv] of one start."""

@@ -47,11 +47,10 @@ def drive(position: Column, velocity: Column, force: Column) -> tuple[Column, Co
 class Classic(Task):
     """What both share: two-dimensional states, and starts drawn as Gymnasium draws them."""
 
-    def start(self, draws: StartDraws) -> tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]]:
+    def start(self, draws: StartDraws) -> tuple[Float[np.ndarray, "R 1"], Float[np.ndarray, "R 1"]]:
         """Position and velocity."""
         states = np.stack([self.start_one(rng) for rng in draws.generators])
-        qpos, qvel = torch.from_numpy(states).split(1, dim=-1)
-        return qpos, qvel
+        return states[:, :1], states[:, 1:]
 
     def start_one(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Position and velocity of one start, [2]."""
@@ -74,17 +73,16 @@ class Pendulum(Classic):
         high = np.array([math.pi, 1.0])
         return rng.uniform(-high, high)
 
-    def observation(self, state: State) -> Float[Tensor, "B 3"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B 3"]:
         """(cos θ, sin θ, ω)."""
-        angle, speed = state.qpos.numpy(), state.qvel.numpy()
-        return torch.from_numpy(np.concatenate([np.cos(angle), np.sin(angle), speed], axis=-1))
+        return np.concatenate([np.cos(state.qpos), np.sin(state.qpos), state.qvel], axis=-1)
 
-    def reward(self, before: State, action: Float[Tensor, "B 1"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 1"], after: State) -> Reward:
         """Minus the squares of `angle` and `speed` before the step, and of the `effort`."""
-        angle = pendulum.angle(before)
-        speed, effort = before.qvel[:, 0].square(), action[:, 0].float().square()
-        cost = angle.square() + 0.1 * speed + 0.001 * effort
-        return Reward(-cost, {"angle": -angle.square(), "speed": -0.1 * speed, "effort": -0.001 * effort})
+        angle, speed = np.square(pendulum.angle(before)), np.square(before.qvel[:, 0])
+        effort = np.square(action[:, 0].astype(np.float32))
+        cost = angle + 0.1 * speed + 0.001 * effort
+        return Reward(-cost, {"angle": -angle, "speed": -0.1 * speed, "effort": -0.001 * effort})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,18 +105,18 @@ class MountainCar(Classic):
         """At rest, near the valley's lowest point."""
         return np.array([rng.uniform(-0.6, -0.4), 0.0])
 
-    def observation(self, state: State) -> Float[Tensor, "B 2"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B 2"]:
         """(position, velocity)."""
-        return torch.cat([state.qpos, state.qvel], dim=-1)
+        return np.concatenate([state.qpos, state.qvel], axis=-1)
 
-    def reward(self, before: State, action: Float[Tensor, "B 1"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 1"], after: State) -> Reward:
         """`goal` 100 at the flag, less `effort` 0.1 F²."""
         return Reward.of(
-            goal=self.terminated(after).double() * self.PRIZE,
-            effort=action[:, 0].square() * -self.EFFORT_WEIGHT,
+            goal=self.terminated(after) * self.PRIZE,
+            effort=np.square(action[:, 0]) * -self.EFFORT_WEIGHT,
         )
 
-    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+    def terminated(self, state: State) -> Bool[np.ndarray, " B"]:
         """The car has reached the flag, rolling forward."""
         return (state.qpos[:, 0] >= self.GOAL) & (state.qvel[:, 0] >= 0)
 

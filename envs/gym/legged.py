@@ -6,9 +6,8 @@ healthy step.
 
 from dataclasses import dataclass
 
-import torch
+import numpy as np
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from envs.gym.base import GymnasiumTask, asset, squares
 from envs.physics import State
@@ -24,18 +23,18 @@ class Runner(GymnasiumTask):
     control_weight: float  # reward per squared action
     hidden: int = 1  # leading positions that the agent does not see
 
-    def observation(self, state: State) -> Float[Tensor, "B do"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B do"]:
         """Positions without the first `hidden`, and velocities."""
-        return torch.cat([state.qpos[:, self.hidden :], state.qvel], dim=-1)
+        return np.concatenate([state.qpos[:, self.hidden :], state.qvel], axis=-1)
 
     def costs(
-        self, before: State, action: Float[Tensor, "B da"], after: State
-    ) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
+        self, before: State, action: Float[np.ndarray, "B da"], after: State
+    ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"]]:
         """Speed along x in m/s and the cost of control."""
         speed = (after.qpos[:, 0] - before.qpos[:, 0]) / self.control_step
         return speed, squares(action) * self.control_weight
 
-    def reward(self, before: State, action: Float[Tensor, "B da"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B da"], after: State) -> Reward:
         """`forward` speed less `ctrl`."""
         forward, control = self.costs(before, action, after)
         return Reward(forward - control, {"forward": forward, "ctrl": -control})
@@ -49,25 +48,25 @@ class Walker(Runner):
     angles: tuple[float, float]  # rad, of the torso, when healthy
     largest: float = float("inf")  # of all other entries of the state, when healthy
 
-    def observation(self, state: State) -> Float[Tensor, "B do"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B do"]:
         """Positions without x, and velocities clipped to ±10."""
-        clipped = state.qvel.clamp(-VELOCITY_CLIP, VELOCITY_CLIP)
-        return torch.cat([state.qpos[:, self.hidden :], clipped], dim=-1)
+        clipped = state.qvel.clip(-VELOCITY_CLIP, VELOCITY_CLIP)
+        return np.concatenate([state.qpos[:, self.hidden :], clipped], axis=-1)
 
-    def reward(self, before: State, action: Float[Tensor, "B da"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B da"], after: State) -> Reward:
         """`forward` speed and `survive`, less `ctrl`."""
         forward, control = self.costs(before, action, after)
-        survive = (~self.terminated(after)).double()
+        survive = (~self.terminated(after)).astype(np.float64)
         return Reward(forward + survive - control, {"forward": forward, "survive": survive, "ctrl": -control})
 
-    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+    def terminated(self, state: State) -> Bool[np.ndarray, " B"]:
         """Torso too low, too high or too far tilted, or the state out of bounds."""
         height, angle = state.qpos[:, 1], state.qpos[:, 2]
         healthy = (self.heights[0] < height) & (height < self.heights[1])
         healthy &= (self.angles[0] < angle) & (angle < self.angles[1])
         if self.largest < float("inf"):
-            rest = torch.cat([state.qpos[:, 2:], state.qvel], dim=-1)
-            healthy &= (rest.abs() < self.largest).all(dim=-1)
+            rest = np.concatenate([state.qpos[:, 2:], state.qvel], axis=-1)
+            healthy &= (np.abs(rest) < self.largest).all(axis=-1)
         return ~healthy
 
 

@@ -3,9 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from envs.gym.base import GymnasiumTask, asset
 from envs.physics import State
@@ -18,17 +16,17 @@ class InvertedPendulum(GymnasiumTask):
 
     LARGEST_ANGLE = 0.2  # rad
 
-    def observation(self, state: State) -> Float[Tensor, "B 4"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B 4"]:
         """Positions and velocities of cart and pole."""
-        return torch.cat([state.qpos, state.qvel], dim=-1)
+        return np.concatenate([state.qpos, state.qvel], axis=-1)
 
-    def reward(self, before: State, action: Float[Tensor, "B 1"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 1"], after: State) -> Reward:
         """`survive`: one for each step that does not end the episode."""
-        return Reward.of(survive=(~self.terminated(after)).double())
+        return Reward.of(survive=(~self.terminated(after)).astype(np.float64))
 
-    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+    def terminated(self, state: State) -> Bool[np.ndarray, " B"]:
         """The pole beyond 0.2 rad."""
-        return state.qpos[:, 1].abs() > self.LARGEST_ANGLE
+        return np.abs(state.qpos[:, 1]) > self.LARGEST_ANGLE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,26 +37,24 @@ class InvertedDoublePendulum(GymnasiumTask):
     LEAST_HEIGHT = 1.0  # m, of the upper tip
     CLIP = 10.0  # of velocities and of the force that holds the cart on its rail, as observed
 
-    def observation(self, state: State) -> Float[Tensor, "B 9"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B 9"]:
         """Cart position, sines and cosines of the joints, velocities, and the rail's force."""
-        angles = state.qpos[:, 1:].numpy()
-        joints = torch.from_numpy(np.concatenate([np.sin(angles), np.cos(angles)], axis=-1))
-        rail = state.derived["qfrc_constraint"][:, :1]
-        clipped = torch.cat([state.qvel, rail], dim=-1).clamp(-self.CLIP, self.CLIP)
-        return torch.cat([state.qpos[:, :1], joints, clipped], dim=-1)
+        angles, rail = state.qpos[:, 1:], state.derived["qfrc_constraint"][:, :1]
+        clipped = np.concatenate([state.qvel, rail], axis=-1).clip(-self.CLIP, self.CLIP)
+        return np.concatenate([state.qpos[:, :1], np.sin(angles), np.cos(angles), clipped], axis=-1)
 
-    def reward(self, before: State, action: Float[Tensor, "B 1"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 1"], after: State) -> Reward:
         """`survive`, less `distance` of the tip from upright and `velocity` of the joints."""
         x, height = after.derived["site_xpos"][:, 0, 0], after.derived["site_xpos"][:, 0, 2]
         lower, upper = after.qvel[:, 1], after.qvel[:, 2]
-        survive = (~self.terminated(after)).double() * self.SURVIVE
-        distance = 0.01 * x.square() + (height - 2).square()
-        velocity = 1e-3 * lower.square() + 5e-3 * upper.square()
+        survive = (~self.terminated(after)).astype(np.float64) * self.SURVIVE
+        distance = 0.01 * np.square(x) + np.square(height - 2)
+        velocity = 1e-3 * np.square(lower) + 5e-3 * np.square(upper)
         return Reward(
             survive - distance - velocity, {"survive": survive, "distance": -distance, "velocity": -velocity}
         )
 
-    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+    def terminated(self, state: State) -> Bool[np.ndarray, " B"]:
         """The upper tip at a height of 1 m or less."""
         return state.derived["site_xpos"][:, 0, 2] <= self.LEAST_HEIGHT
 

@@ -4,12 +4,10 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
-from torch import Tensor
 
-from envs.gym.base import GymnasiumTask, asset, numpy_sum, shared, squares
+from envs.gym.base import GymnasiumTask, asset, shared, squares
 from envs.physics import MujocoPhysics, State
 from envs.task import Reward
 
@@ -18,6 +16,11 @@ from envs.task import Reward
 
 FORCES = "cfrc_ext"  # external forces on the bodies, [nbody, 6]
 LARGEST_TORQUE = float(np.float32(0.4))  # of the humanoid, by Gymnasium's action space
+
+
+def flat(values: Float[np.ndarray, "B ..."]) -> Float[np.ndarray, "B n"]:
+    """One row for each copy."""
+    return values.reshape(len(values), -1)
 
 
 class ContactPhysics(MujocoPhysics):
@@ -34,8 +37,8 @@ class ContactPhysics(MujocoPhysics):
         super().__init__(model, copies, substeps, threads, derived, persistent=True)
         self._data = mujoco.MjData(model)
         self._forces = np.zeros((copies, model.nbody, 6))
-        self.derived[FORCES] = torch.from_numpy(self._forces)
-        self._past_derived[FORCES] = self.derived[FORCES].clone()
+        self.derived[FORCES] = self._forces
+        self._past_derived[FORCES] = self._forces.copy()
 
     def advance(self) -> State:
         """Advance every copy, then compute the external forces; see `Physics.advance`."""
@@ -46,7 +49,9 @@ class ContactPhysics(MujocoPhysics):
             forces[:] = data.cfrc_ext
         return past
 
-    def place(self, rows: NDArray[np.intp], qpos: Float[Tensor, "R nq"], qvel: Float[Tensor, "R nv"]) -> None:
+    def place(
+        self, rows: NDArray[np.intp], qpos: Float[np.ndarray, "R nq"], qvel: Float[np.ndarray, "R nv"]
+    ) -> None:
         """Reset copies; Gymnasium shows no forces until the first step. See `Physics.place`."""
         super().place(rows, qpos, qvel)
         self._forces[rows] = 0
@@ -71,25 +76,25 @@ class Ant(Body):
     CONTACT_WEIGHT = 5e-4
     LARGEST_FORCE = 1.0  # forces are clipped to it
 
-    def observation(self, state: State) -> Float[Tensor, "B 105"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B 105"]:
         """Positions without x and y, velocities, and the bodies' clipped external forces."""
-        forces = state.derived[FORCES][:, 1:].clamp(-self.LARGEST_FORCE, self.LARGEST_FORCE)
-        return torch.cat([state.qpos[:, 2:], state.qvel, forces.flatten(1)], dim=-1)
+        forces = state.derived[FORCES][:, 1:].clip(-self.LARGEST_FORCE, self.LARGEST_FORCE)
+        return np.concatenate([state.qpos[:, 2:], state.qvel, flat(forces)], axis=-1)
 
-    def reward(self, before: State, action: Float[Tensor, "B 8"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 8"], after: State) -> Reward:
         """`forward` speed of the torso and `survive`, less `ctrl` and `contact`."""
         moved = after.derived["xpos"][:, 1, 0] - before.derived["xpos"][:, 1, 0]
         forward = moved / self.control_step
-        survive = (~self.terminated(after)).double()
+        survive = (~self.terminated(after)).astype(np.float64)
         control = squares(action) * self.CONTROL_WEIGHT
-        forces = after.derived[FORCES].clamp(-self.LARGEST_FORCE, self.LARGEST_FORCE)
-        contact = numpy_sum(forces.square()) * self.CONTACT_WEIGHT
+        forces = after.derived[FORCES].clip(-self.LARGEST_FORCE, self.LARGEST_FORCE)
+        contact = flat(np.square(forces)).sum(axis=-1) * self.CONTACT_WEIGHT
         return Reward(
             forward + survive - (control + contact),
             {"forward": forward, "survive": survive, "ctrl": -control, "contact": -contact},
         )
 
-    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+    def terminated(self, state: State) -> Bool[np.ndarray, " B"]:
         """Torso outside its healthy heights."""
         height = state.qpos[:, 2]
         return ~((self.heights[0] <= height) & (height <= self.heights[1]))
@@ -105,43 +110,42 @@ class Humanoid(Body):
     LARGEST_CONTACT_COST = 10.0
     SURVIVE = 5.0
 
-    def observation(self, state: State) -> Float[Tensor, "B 348"]:
+    def observation(self, state: State) -> Float[np.ndarray, "B 348"]:
         """Positions without x and y, velocities, and per body: inertia, velocity, actuation, forces."""
         derived = state.derived
-        return torch.cat(
+        return np.concatenate(
             [
                 state.qpos[:, 2:],
                 state.qvel,
-                derived["cinert"][:, 1:].flatten(1),
-                derived["cvel"][:, 1:].flatten(1),
+                flat(derived["cinert"][:, 1:]),
+                flat(derived["cvel"][:, 1:]),
                 derived["qfrc_actuator"][:, 6:],
-                derived[FORCES][:, 1:].flatten(1),
+                flat(derived[FORCES][:, 1:]),
             ],
-            dim=-1,
+            axis=-1,
         )
 
-    def reward(self, before: State, action: Float[Tensor, "B 17"], after: State) -> Reward:
+    def reward(self, before: State, action: Float[np.ndarray, "B 17"], after: State) -> Reward:
         """`forward` speed of the centre of mass and `survive`, less `ctrl` and `contact`."""
         forward = (self._centre(after) - self._centre(before)) / self.control_step * self.FORWARD_WEIGHT
-        survive = (~self.terminated(after)).double() * self.SURVIVE
-        control = numpy_sum(action.double().square()) * self.CONTROL_WEIGHT
-        contact = numpy_sum(after.derived[FORCES].square()) * self.CONTACT_WEIGHT
-        contact = contact.clamp(max=self.LARGEST_CONTACT_COST)
+        survive = (~self.terminated(after)).astype(np.float64) * self.SURVIVE
+        control = np.square(action).sum(axis=-1) * self.CONTROL_WEIGHT
+        contact = flat(np.square(after.derived[FORCES])).sum(axis=-1) * self.CONTACT_WEIGHT
+        contact = np.minimum(contact, self.LARGEST_CONTACT_COST)
         return Reward(
             forward + survive - (control + contact),
             {"forward": forward, "survive": survive, "ctrl": -control, "contact": -contact},
         )
 
-    def terminated(self, state: State) -> Bool[Tensor, " B"]:
+    def terminated(self, state: State) -> Bool[np.ndarray, " B"]:
         """Torso outside its healthy heights."""
         height = state.qpos[:, 2]
         return ~((self.heights[0] < height) & (height < self.heights[1]))
 
-    def _centre(self, state: State) -> Float[Tensor, " B"]:
+    def _centre(self, state: State) -> Float[np.ndarray, " B"]:
         """Where along x the centre of mass was at the last physics step, added in NumPy's order."""
         mass = shared(self.scene).body_mass
-        places = state.derived["xipos"].numpy()
-        return torch.from_numpy((np.einsum("b,nbj->nj", mass, places) / mass.sum())[:, 0].copy())
+        return (np.einsum("b,nbj->nj", mass, state.derived["xipos"]) / mass.sum())[:, 0]
 
 
 TASKS = (

@@ -5,7 +5,6 @@ import math
 import mujoco
 import numpy as np
 import pytest
-import torch
 
 from envs import atwood
 from envs.models import stripped
@@ -41,12 +40,11 @@ def machine(ratio: float) -> MujocoPhysics:
 def motion(ratio: float, start: list[float], seconds: float) -> np.ndarray:
     """(θ, r, θ̇, ṙ) every 2 ms of free motion, [T + 1, 4]."""
     physics = machine(ratio)
-    qpos, qvel = torch.tensor([start], dtype=torch.float64).split(2, dim=1)
-    physics.place(np.arange(1), qpos, qvel)
+    physics.place(np.arange(1), np.array([start[:2]]), np.array([start[2:]]))
     states = [np.array(start)]
     for _ in range(round(seconds / 0.002)):
         physics.advance()
-        states.append(torch.cat([physics.qpos, physics.qvel], 1)[0].numpy().copy())
+        states.append(np.concatenate([physics.qpos[0], physics.qvel[0]]))
     return np.stack(states)
 
 

@@ -225,7 +225,14 @@ def test_lost_simulations_are_counted_and_warned_of_once(task):
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("learners", 0), ("num_envs", -1), ("horizon", 0), ("threads", 0), ("velocity_noise", -0.1)],
+    [
+        ("learners", 0),
+        ("num_envs", -1),
+        ("horizon", 0),
+        ("threads", 0),
+        ("velocity_noise", -0.1),
+        ("dtype", torch.bfloat16),
+    ],
 )
 def test_an_option_out_of_range_is_refused(option, value):
     with pytest.raises(ValueError, match=f"{option} .*not {value}"):

@@ -87,7 +87,7 @@ def test_noise_can_be_switched_off():
     for seed in (0, 1):
         env = gymnasium.make_vec("torch_gprl/pendulum-swingup", num_envs=1, noise=envs.Noise())
         env.reset(seed=seed)
-        env.unwrapped._copies.place(torch.ones(1, 1).double(), torch.ones(1, 1).double())
+        env.unwrapped._copies.place(np.ones((1, 1)), np.ones((1, 1)))
         steps.append(env.step(np.zeros((1, 1), dtype=np.float32))[0])
     np.testing.assert_array_equal(*steps)
 

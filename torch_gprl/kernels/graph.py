@@ -11,7 +11,8 @@ everywhere.
 
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,9 +24,36 @@ from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
 
 Table = tuple[Tensor, ...]
 Factors = tuple[Tensor, Tensor]
+Found = TypeVar("Found")
 
 REMEMBERED = 8  # inputs whose features are kept: a basis, and what one step compares it with
 SMALLEST_REST = 1e-12  # of what the graph leaves open: a root of 0 has no derivative
+
+
+class Remembered(Generic[Found]):
+    """What was found for the last few inputs, and is worth keeping until what it was found from changes."""
+
+    def __init__(self) -> None:
+        self._sources: tuple[int, ...] = ()
+        self._kept: deque[tuple[Tensor, int, Found]] = deque(maxlen=REMEMBERED)
+
+    def renewed(self, sources: Iterable[Tensor]) -> bool:
+        """Whether the sources have changed since the last call; if so, all is forgotten."""
+        seen = tuple(number for t in sources for number in (t._version, t.data_ptr()))
+        if seen == self._sources:
+            return False
+        self._sources = seen
+        self._kept.clear()
+        return True
+
+    def find(self, x: Tensor, make: Callable[[Tensor], Found]) -> Found:
+        """What `make` says of x, or said of the same numbers before."""
+        for old, version, found in self._kept:
+            if version == old._version and (_same_memory(old, x) or torch.equal(old, x)):
+                return found
+        found = make(x)
+        self._kept.append((x, x._version, found))
+        return found
 
 
 class TableKernel(Kernel):
@@ -42,8 +70,7 @@ class TableKernel(Kernel):
     def __init__(self, input_dim: int, batch_shape: Sequence[int] = ()) -> None:
         super().__init__(input_dim, batch_shape)
         self._table: Table = ()
-        self._table_seen: tuple[int, ...] = ()
-        self._remembered: deque[tuple[Tensor, int, Factors]] = deque(maxlen=REMEMBERED)
+        self._remembered: Remembered[Factors] = Remembered()
 
     @abstractmethod
     def _build_table(self) -> Table:
@@ -60,17 +87,9 @@ class TableKernel(Kernel):
         if torch.is_grad_enabled() and (x.requires_grad or any(source.requires_grad for source in sources)):
             return self._features_of_rows(x, self._build_table())
         with torch.no_grad():
-            seen = *(t._version for t in sources), *(t.data_ptr() for t in sources)
-            if seen != self._table_seen:
+            if self._remembered.renewed(sources):
                 self._table = self._build_table()
-                self._table_seen = seen
-                self._remembered.clear()
-            for old, version, found in self._remembered:
-                if version == old._version and (_same_memory(old, x) or torch.equal(old, x)):
-                    return found
-            found = self._features_of_rows(x, self._table)
-            self._remembered.append((x, x._version, found))
-            return found
+            return self._remembered.find(x, lambda x: self._features_of_rows(x, self._table))
 
     def _features_of_rows(self, x: Tensor, table: Table) -> Factors:
         """Features of x, whose leading dimensions beyond the kernel's batch are more rows of each learner."""

@@ -16,8 +16,11 @@ vertices nearest to the input itself: near a ridge the prior stays wide.
 | Mφ | `vertices` | expected discounted sum of φ from each visited state on |
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
+from jaxtyping import Float
 from scipy.sparse import csc_array, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
@@ -26,13 +29,22 @@ from torch.autograd.function import FunctionCtx
 from torch_gprl.graphs.experience import Experience
 from torch_gprl.graphs.interpolation import Neighbours
 from torch_gprl.kernels.distance import log_gaussian
-from torch_gprl.kernels.graph import SMALLEST_REST, Factors, Table, TableKernel, exponential
+from torch_gprl.kernels.graph import SMALLEST_REST, Factors, Remembered, Table, TableKernel, exponential
 from torch_gprl.kernels.graph_geodesic import check_discount
 from torch_gprl.kernels.parameters import Positive, PositiveValue, log_parameter
 from torch_gprl.linalg import cholesky
 from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
 
 FIRST_DOUBT = 0.1  # until it is set or fitted
+
+
+class Way(NamedTuple):
+    """Where inputs are expected to go, whatever the parameters are."""
+
+    points: list[Float[Tensor, "*batch N D"]]  # of each step: x, its successor, and so on
+    weights: list[Float[Tensor, "*batch N"]]  # γ^t times the part that has not ended; of one step more
+    start: Neighbours  # of x
+    end: Neighbours  # of the point that the last step reaches
 
 
 class SuccessorKernel(TableKernel):
@@ -76,6 +88,7 @@ class SuccessorKernel(TableKernel):
         self.experience = experience
         self.discount = discount
         self.lookahead = lookahead
+        self._ways: Remembered[Way] = Remembered()
 
     def forward(self, x: Inputs, z: OtherInputs) -> CrossMatrix:
         """Covariance of x [*batch, N, D] with z [*batch, M, D]: [*batch, N, M]."""
@@ -111,34 +124,49 @@ class SuccessorKernel(TableKernel):
         going = self.discount * (~visited.terminated).to(inverse.dtype)
         rows = visited.ends.reshape(-1, visited.capacity).any(0).nonzero().flatten()  # an end of any learner
         ends = visited.ends[..., rows]
-        ahead, left, reached = self._follow(visited.next_states[..., rows, :], landmarks, inverse)
+        way = self._way(visited.next_states[..., rows, :])
+        ahead, left = self._along(way, landmarks, inverse), way.weights[-1]
         rewards = rewards.index_add(-2, rows, (going[..., rows] * ends).unsqueeze(-1) * ahead)
         going[..., rows] *= torch.where(ends, left, 1.0)
-        found = visited.nearest(reached)
-        nodes[..., rows, :] = torch.where(ends.unsqueeze(-1), found.nodes, nodes[..., rows, :])
-        weights[..., rows, :] = torch.where(ends.unsqueeze(-1), found.weight, weights[..., rows, :])
+        nodes[..., rows, :] = torch.where(ends.unsqueeze(-1), way.end.nodes, nodes[..., rows, :])
+        weights[..., rows, :] = torch.where(ends.unsqueeze(-1), way.end.weight, weights[..., rows, :])
         return _resolve(nodes, weights * going.unsqueeze(-1), rewards)
 
     def _build_features(self, x: Tensor, table: Table) -> Factors:
         """F [*batch, N, L], and the root of the variance that is left undecided [*batch, N, 1]."""
         landmarks, inverse, vertices = table
-        ahead, left, reached = self._follow(x, landmarks, inverse)
-        left = left.unsqueeze(-1)
-        average, spread = _agreement(self.experience.nearest(reached), vertices)
-        _, spread_here = _agreement(self.experience.nearest(x), vertices)
+        way = self._way(x)
+        left = way.weights[-1].unsqueeze(-1)
+        average, spread = _agreement(way.end, vertices)
+        _, spread_here = _agreement(way.start, vertices)
         undecided = left.square() * spread + self.doubt[..., None, None] * spread_here
-        return ahead + left * average, undecided.clamp_min(SMALLEST_REST).sqrt()
+        return self._along(way, landmarks, inverse) + left * average, undecided.clamp_min(
+            SMALLEST_REST
+        ).sqrt()
 
-    def _follow(self, x: Tensor, landmarks: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Discounted φ along the expected way from x, the weight of what follows, and where that is."""
+    def _way(self, x: Tensor) -> Way:
+        """The expected way from x, found once while a fit tries many parameters."""
+        if torch.is_grad_enabled() and x.requires_grad:
+            return self._follow(x)
+        self._ways.renewed(self.experience.buffers())
+        return self._ways.find(x, self._follow)
+
+    def _follow(self, x: Tensor) -> Way:
         batch = torch.broadcast_shapes(x.shape[:-2], self.batch_shape)
-        total = x.new_zeros(*batch, x.shape[-2], inverse.shape[-1])
-        weight = x.new_ones(*batch, x.shape[-2])
+        here, weight = x, x.new_ones(*batch, x.shape[-2])
+        points, weights = [], [weight]
         for _ in range(self.lookahead):
-            total = total + weight.unsqueeze(-1) * self._reward_features(x, landmarks, inverse)
-            x, alive = self.experience.successor(x)
-            weight = weight * self.discount * alive
-        return total, weight, x
+            points.append(here)
+            here, alive = self.experience.successor(here)
+            weights.append(weights[-1] * self.discount * alive)
+        return Way(points, weights, self.experience.nearest(x), self.experience.nearest(here))
+
+    def _along(self, way: Way, landmarks: Tensor, inverse: Tensor) -> Tensor:
+        """Discounted φ along the way, summed up to its last step."""
+        total = inverse.new_zeros(*way.weights[0].shape, landmarks.shape[-2])
+        for point, weight in zip(way.points, way.weights, strict=False):
+            total = total + weight.unsqueeze(-1) * log_gaussian(point, landmarks, self.log_lengthscale).exp()
+        return total @ inverse.mT
 
     def _reward_features(self, x: Tensor, landmarks: Tensor, inverse: Tensor) -> Tensor:
         return log_gaussian(x, landmarks, self.log_lengthscale).exp() @ inverse.mT

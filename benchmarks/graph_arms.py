@@ -48,15 +48,6 @@ class Arm:
     kernel: Callable[[Graph, int], Kernel]  # from the graph and input columns
 
 
-@dataclass(frozen=True)
-class Learned:
-    """A process that has learned, and the seconds that it took."""
-
-    gp: SparseOnlineGP
-    tuning: float
-    learning: float
-
-
 def _nodes(dims: int, transitions: int) -> TransitionGraph:
     return TransitionGraph(dims, MOST_NODES, NearestEdges(NEIGHBOURS))
 
@@ -149,8 +140,8 @@ class Tuned:
         self.seconds = time.perf_counter() - start
 
     @torch.no_grad()
-    def learn(self, budget: int, seed: int) -> Learned:
-        """Learn all trajectories with so many basis vectors."""
+    def learn(self, budget: int, seed: int) -> tuple[SparseOnlineGP, float]:
+        """A process of so many basis vectors that has learned all trajectories, and the seconds it took."""
         if isinstance(self.graph, TransitionGraph):
             self.graph.eliminate(self.graph.mask)
         gp = SparseOnlineGP(self.kernel, budget, self.noise)
@@ -161,7 +152,7 @@ class Tuned:
             gp.update(states[block], targets[block])
             if isinstance(self.graph, TransitionGraph):
                 self.graph.follow(gp.basis, gp.mask)
-        return Learned(gp, self.seconds, time.perf_counter() - start)
+        return gp, time.perf_counter() - start
 
 
 def grow(graph: Graph, seen: Trajectories, which: Tensor) -> None:

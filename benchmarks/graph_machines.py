@@ -16,7 +16,7 @@ from torch import Tensor
 from benchmarks.graph_systems import System
 
 GRAVITY = 9.81
-CATCH_ANGLE, CATCH_SPEED = 0.8, 1.5  # rad, rad/s
+CATCH_SPEED = 1.5  # rad/s
 PUSH, ENOUGH_ENERGY = 1.5, 1.15 * GRAVITY  # N m, J
 SPEED_UNIT = 4.0  # rad/s: inputs are (cos θ, sin θ, ω / SPEED_UNIT)
 
@@ -30,16 +30,19 @@ def upright(angle: Tensor) -> Tensor:
 class Jump(System):
     """A pendulum that is caught or swings freely: 1 kg on a rod of 1 m, state (θ, ω), θ = 0 upright."""
 
+    catch_angle: float = 0.8  # rad from upright, within which a slow pole is caught
+
     kind = "jump"
     centre = (0.0, 0.0)
     extent = (math.pi, 8.0)  # rad, rad/s
+    axes = ("angle from upright in rad", "speed in rad/s")
     most_action = 5.0  # N m
     friction: ClassVar[float] = 0.05  # N m s
 
     def control(self, state: Tensor) -> Tensor:
         """Catches near the top."""
         angle, speed = upright(state[..., 0]), state[..., 1]
-        caught = (angle.abs() < CATCH_ANGLE) & (speed.abs() < CATCH_SPEED)
+        caught = (angle.abs() < self.catch_angle) & (speed.abs() < CATCH_SPEED)
         catch = (-25 * angle - 8 * speed).clamp(-self.most_action, self.most_action)
         return torch.where(caught, catch, self.otherwise(state))
 
@@ -60,6 +63,10 @@ class Jump(System):
         """(cos θ, sin θ, ω)."""
         angle, speed = state.unbind(-1)
         return torch.stack((angle.cos(), angle.sin(), speed / SPEED_UNIT), -1)
+
+    def plane(self, inputs: Tensor) -> Tensor:
+        """(θ, ω)."""
+        return torch.stack((torch.atan2(inputs[..., 1], inputs[..., 0]), SPEED_UNIT * inputs[..., 2]), -1)
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,13 @@
 """Robots under fixed sub-optimal policies, whose values jump: the ground truth of the graph kernels.
 
-A system is simulated by Runge-Kutta, many states at once. Values are returns of long roll-outs from each
+A system is simulated in time, many states at once. Values are returns of long roll-outs from each
 state under its policy; action values take a given first action. What a learner sees are trajectories with
 noisy returns.
 """
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Optional
 
 import torch
 from jaxtyping import Bool, Float
@@ -27,10 +27,12 @@ class System(ABC):
     action_noise: float = 0.0  # standard deviation of the policy's action, in its units
     roll_outs: int = 1  # averaged for the true value of a state
     action_values: bool = False  # Q(s, a) instead of V(s)
+    before: Optional["System"] = None  # the policy that made the first half of the trajectories, if another
 
     kind: ClassVar[str]
     centre: ClassVar[tuple[float, ...]]  # of the states that are looked at
     extent: ClassVar[tuple[float, ...]]  # half of their range
+    axes: ClassVar[tuple[str, ...]] = ()  # names of the two coordinates of a state, where there are two
     most_action: ClassVar[float]
     time_step: ClassVar[float] = 0.05  # s
     substeps: ClassVar[int] = 2
@@ -51,6 +53,10 @@ class System(ABC):
     def inputs(self, state: Tensor) -> Tensor:
         """What a learner sees of states [..., d]: [..., D]."""
 
+    def plane(self, inputs: Tensor) -> Tensor:
+        """States [..., 2] of inputs [..., D], where `axes` names their coordinates."""
+        raise NotImplementedError(f"states of {self.kind} are no points of a plane")
+
     def limit(self, state: Tensor) -> Tensor:
         """States held within the machine's stops."""
         return state
@@ -59,7 +65,8 @@ class System(ABC):
     def name(self) -> str:
         """How results are called."""
         noise = f", noise {self.action_noise:g}" if self.action_noise else ""
-        return self.kind + noise + (", Q(s, a)" if self.action_values else "")
+        changed = ", changed policy" if self.before else ""
+        return self.kind + noise + changed + (", Q(s, a)" if self.action_values else "")
 
     @property
     def file_name(self) -> str:
@@ -153,6 +160,18 @@ def experience(system: System, truth: Truth, seed: int, count: int, steps: int, 
         noise: standard deviation on targets, in those of the value.
     """
     torch.manual_seed(seed)
+    if system.before is None:
+        return _trajectories(system, truth, count, steps, noise)
+    older = _trajectories(system.before, truth, count // 2, steps, noise)
+    newer = _trajectories(system, truth, count - count // 2, steps, noise)
+    return Trajectories(
+        torch.cat([older.states, newer.states]),
+        torch.cat([older.next_states, newer.next_states]),
+        torch.cat([older.targets, newer.targets]),
+    )
+
+
+def _trajectories(system: System, truth: Truth, count: int, steps: int, noise: float) -> Trajectories:
     spread = EXPLORATION * system.most_action if system.action_values else system.action_noise
     state, path, actions = system.sample(count), [], []
     for _ in range(steps):

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from benchmarks import graph_systems
 from benchmarks.graph_machines import GRAVITY, Atwood, CartPole, Jump, Spiral
+from benchmarks.graph_maze import DOCK, GOAL, WALLS, Maze
 from benchmarks.graph_systems import DISCOUNT, System, experience, true_values
 
 MACHINES = (Jump(), Spiral(), CartPole(), Atwood(), Jump(action_values=True))
@@ -60,3 +61,32 @@ def test_values_keep_to_bellman_and_a_policys_own_action_changes_nothing():
     values, (following, reward) = system.values(states), system.step(states, system.control(states))
     torch.testing.assert_close(values, reward + DISCOUNT * system.values(following), rtol=0, atol=0.02)
     torch.testing.assert_close(system.values(states, system.control(states)), values)
+
+
+def test_walls_let_nothing_through_and_the_policy_finds_the_way_round_them():
+    maze = Maze()
+    state = maze.sample(300)
+    for step in range(250):
+        heading = maze.control(state) if step >= 50 else maze.act(state, 2.0)
+        following = maze.step(state, heading)[0]
+        for place, low, high in WALLS:
+            crossed = (state[:, 0] < place) != (following[:, 0] < place)
+            share = (place - state[:, 0]) / (following[:, 0] - state[:, 0])
+            height = (state[:, 1] + share * (following[:, 1] - state[:, 1]))[crossed]
+            assert ((height < low) | (height > high)).all()
+        state = following
+    assert float((state - torch.tensor(GOAL)).norm(dim=-1).max()) < DOCK
+
+
+def test_after_a_change_of_policy_half_of_the_trajectories_are_those_of_the_older_one(monkeypatch):
+    monkeypatch.setattr(graph_systems, "HORIZON", 60)
+    older = Jump(catch_angle=0.2)
+    system = Jump(before=older)
+    states = system.sample(40)
+    truth = true_values(system, states)
+    mixed = experience(system, truth, 1, 8, 5, noise=0.0)
+    old = experience(older, truth, 1, 4, 5, noise=0.0)
+    torch.testing.assert_close(mixed.states[:4], old.states)
+    torch.testing.assert_close(mixed.targets[:4], old.targets)
+    assert older.name == "jump"
+    assert system.name == "jump, changed policy"

@@ -5,16 +5,47 @@ are views of the rows in use, and nothing is masked.
 """
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torch_gprl.gp.bounded import YOUTH, BoundedBasis, admissions
 from torch_gprl.gp.observed import Observed
-from torch_gprl.gp.whitened import NOVELTY_FLOOR, solve_triangular, squared_columns
+from torch_gprl.gp.whitened import NOVELTY_FLOOR, Active, solve_triangular, squared_columns
+from torch_gprl.kernels.stationary import Stationary
 
 LOG_TWO_PI = math.log(2 * math.pi)
 LARGE = 128  # rows and points from which a matrix product in parts is faster
+
+
+class InUse(NamedTuple):
+    """The rows in use, as views without a dimension for learners."""
+
+    active: Active  # of which these are views
+    whole: Tensor  # the precision of all rows, likewise
+    gram_factor: Tensor
+    precision: Tensor
+    information: Tensor
+    prior: float | None  # the kernel's variance, where it is the same everywhere
+
+    @classmethod
+    def of(cls, gp: BoundedBasis) -> "InUse":
+        """Those of now; remembered until the basis changes."""
+        active, whole, known = gp._active(), gp._buffers["precision"], gp._in_use
+        if known is not None and known.active is active and known.whole is whole:
+            return known
+        used, kernel = slice(active.rows), gp.kernel
+        found = cls(
+            active,
+            gp.precision,
+            _only(active.gram_factor, 2),
+            _only(gp.precision, 2)[used, used],
+            _only(gp.information, 1)[used],
+            float(kernel.outputscale) if isinstance(kernel, Stationary) else None,
+        )
+        gp._in_use = found
+        return found
 
 
 def absorb(gp: BoundedBasis, block: Observed, noise_variance: float) -> None:
@@ -51,20 +82,22 @@ def _absorb_block(gp: BoundedBasis, inputs: Tensor, targets: Tensor, noise_varia
 
 def _absorb_point(gp: BoundedBasis, point: Tensor, target: Tensor, noise_variance: float) -> int:
     """`_absorb_block` for one point, in half the time."""
-    phi, variance = _explain(gp, point)
-    rows, prior = len(phi), float(variance)
-    novelty = prior - float(squared_columns(phi))
+    used = InUse.of(gp)
+    phi = solve_triangular(used.gram_factor, _only(used.active.cross(point), 2))
+    column, rows = phi[:, 0], len(phi)
+    prior = float(gp.kernel.diag(point)) if used.prior is None else used.prior
+    novelty = prior - float(column.dot(column))
     threshold = max(gp.novelty_threshold * noise_variance, NOVELTY_FLOOR[phi.dtype] * prior)
     if novelty > threshold and _most_additions(gp, rows, 1):
         phi = torch.cat([phi, phi.new_full((1, 1), math.sqrt(novelty))])
         _append(gp, rows, phi.mT, point)
-        rows, novelty = rows + 1, 0.0
+        used, column, novelty = InUse.of(gp), phi[:, 0], 0.0
     weight = 1 / (noise_variance + novelty) if gp.projection == "moment" else 1 / noise_variance
     observed = float(target)
-    _only(gp.precision, 2)[:rows, :rows].addmm_(phi, phi.mT, alpha=weight)
-    _only(gp.information, 1)[:rows].add_(phi[:, 0], alpha=weight * observed)
+    used.precision.addmm_(phi, phi.mT, alpha=weight)
+    used.information.add_(column, alpha=weight * observed)
     gp.evidence_constant.add_(0.5 * (math.log(weight) - weight * observed**2 - LOG_TWO_PI))
-    return rows
+    return len(phi)
 
 
 def _explain(gp: BoundedBasis, inputs: Tensor) -> tuple[Tensor, Tensor]:

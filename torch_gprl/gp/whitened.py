@@ -218,8 +218,7 @@ class WhitenedState(nn.Module):
             return Solved(self.precision_factor, self.weights, _coefficients(self.gram_factor, self.weights))
         if self._kernel_versions() != self._kernel_seen:
             self.rebase()
-        seen = self.gram_factor._version, self.precision._version, self.information._version
-        seen = *seen, id(self.precision)
+        seen = self._versions("gram_factor", "precision", "information")
         if self._solution is None or seen != self._solution_seen:
             active = self._active()
             used = slice(active.rows)
@@ -249,6 +248,7 @@ class WhitenedState(nn.Module):
         self._kernel_seen = self._kernel_versions()
         self._solution: Solved | None = None
         self._active_rows: Active | None = None
+        self._in_use: Any = None  # views of them for a learner that is alone, see `one_learner`
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "WhitenedState":
         super()._apply(fn, recurse)
@@ -259,11 +259,16 @@ class WhitenedState(nn.Module):
     def __getstate__(self) -> dict[str, Any]:
         """Without what is derived, which a copy makes anew."""
         _before_save(self, "", False)
-        return {**self.__dict__, "_active_rows": None, "_solution": None}
+        return {**self.__dict__, "_active_rows": None, "_in_use": None, "_solution": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._accept_state()  # a copied state is up to date with the copied kernel
+
+    def _versions(self, *names: str) -> tuple[int, ...]:
+        """What changes when these buffers do; read where a module keeps them, at half the price."""
+        buffers = [self._buffers[name] for name in names]
+        return *(buffer._version for buffer in buffers if buffer is not None), *map(id, buffers)
 
     def _kernel_versions(self) -> tuple[int, ...]:
         return id(self.kernel), *(tensor._version for tensor in self._kernel_tensors)
@@ -273,7 +278,7 @@ class WhitenedState(nn.Module):
         if torch.compiler.is_compiling() or self.size.device.type != "cpu":
             cross = partial(self.kernel, self.basis)
             return Active(self.capacity, self.basis, cross, self.gram_factor, self.mask.unsqueeze(-1))
-        seen = self.basis._version, self.gram_factor._version, id(self.basis)
+        seen = self._versions("basis", "gram_factor")
         if self._active_rows is None or seen != self._active_seen:
             sizes = self.size.flatten().tolist()
             rows = max(sizes, default=0)

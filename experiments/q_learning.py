@@ -3,7 +3,8 @@
     python -m experiments.q_learning [--task pendulum-swingup] [--learners 20] [--frames 5000]
 
 The arms are the thesis' online GP Q-learning, fitted Q iteration on the same Gaussian process, and tables of
-three resolutions. Leaves summary.json with every evaluation, and a picture of the learning curves.
+three resolutions. Leaves summary.json with every evaluation, and a picture of the learning curves. A rerun
+with the same numbers skips the arms that it finds there.
 """
 
 import json
@@ -39,6 +40,7 @@ class Options:
     episodes: int = 5  # of an evaluation, for each learner
     discount: float = 0.95  # γ per environment step
     seed: int = 0  # of all arms
+    most_arms: int = 99  # to run now; a later call goes on
     out: Path = Path("runs/q-learning")  # where results go
 
 
@@ -116,23 +118,49 @@ def draw(frames: Float[np.ndarray, " evaluations"], curves: dict[str, np.ndarray
 
 
 def main(options: Options) -> None:
-    """Run every arm, leave summary and picture."""
+    """Run the arms that are missing, leave summary and picture."""
     torch.set_num_threads(1)
-    folder, curves = options.out / options.task, {}
-    for name, make in arms(options).items():
-        curves[name] = run(options, make)
-        low, high = bootstrap_interval(curves[name][-1])
-        print(f"{name:28s} final return {curves[name][-1].mean():8.1f} [{low:.1f}, {high:.1f}]", flush=True)
-    frames = options.every * np.arange(1.0, len(next(iter(curves.values()))) + 1)
+    folder = options.out / options.task
     folder.mkdir(parents=True, exist_ok=True)
+    curves, left = recorded(folder / "summary.json", options), options.most_arms
+    for name, make in arms(options).items():
+        if name not in curves and left:
+            left -= 1
+            curves[name] = run(options, make)
+            write(folder, options, curves)
+        if name in curves:
+            low, high = bootstrap_interval(curves[name][-1])
+            print(
+                f"{name:28s} final return {curves[name][-1].mean():8.1f} [{low:.1f}, {high:.1f}]", flush=True
+            )
+    print(f"everything is in {folder}")
+
+
+def numbers(options: Options) -> dict[str, object]:
+    """Options that change what an arm learns."""
+    return {name: value for name, value in asdict(options).items() if name not in ("out", "most_arms")}
+
+
+def recorded(summary: Path, options: Options) -> dict[str, np.ndarray]:
+    """The curves of an earlier call with the same numbers."""
+    if not summary.exists():
+        return {}
+    earlier = json.loads(summary.read_text(encoding="utf-8"))
+    if earlier["options"] != numbers(options):
+        return {}
+    return {name: np.array(returns) for name, returns in earlier["returns"].items()}
+
+
+def write(folder: Path, options: Options, curves: dict[str, np.ndarray]) -> None:
+    """The summary, and the picture of the learning curves."""
+    frames = options.every * np.arange(1.0, len(next(iter(curves.values()))) + 1)
     result = {
-        "options": asdict(options) | {"out": str(options.out)},
+        "options": numbers(options),
         "frames": frames.tolist(),
         "returns": {name: returns.tolist() for name, returns in curves.items()},
     }
     (folder / "summary.json").write_text(json.dumps(result, ensure_ascii=False) + "\n", encoding="utf-8")
     save_figure(draw(frames, curves, options.task), folder / "curves.png")
-    print(f"everything is in {folder}")
 
 
 if __name__ == "__main__":

@@ -19,10 +19,9 @@ import functools
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torchrl import logger as torchrl_logger
@@ -45,7 +44,6 @@ from torch_gprl.runs import (
     Algorithm,
     Checkpoints,
     CommandLine,
-    LoggerName,
     MetricsWriter,
     Progress,
     RunFailure,
@@ -66,6 +64,8 @@ from torch_gprl.runs import (
     save_figure,
     save_graph,
     summary,
+    tell,
+    unread_output_allowed,
     value_on_plane,
     value_surface,
     write_report,
@@ -79,46 +79,14 @@ from torch_gprl.runs.command_options import (
     RenderOptions,
     ReportOptions,
     ResumeOptions,
+    RunOptions,
     TasksOptions,
 )
 
-CollectorName = Literal["multi-sync", "multi-async", "ray"]
 LONGEST_FILM = 300  # frames
 JUDGED_EPISODES = 5  # over which a critic's foresight is shown
 WORKER_STRIDE = 7_368_787  # keeps the seeds of workers apart; a prime above any count of runs
 PICTURES = Path(__file__).parent / "docs" / "tasks.jpg"
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """What to run, where, and where to keep it."""
-
-    task: str = "pendulum-swingup"  # id of the task; a wrong one lists all
-    learners: int = 5  # independent learners, trained side by side; the learning curve shows their spread
-    num_envs: int = 5  # environments of each learner, stepped together
-    seed: int = 0  # of all random numbers; the evaluation has a seed of its own
-    threads: int = 1  # processor threads of torch and of the simulator
-    workers: int = 0  # processes that share the environments and collect side by side; 0 collects right here
-    collector: CollectorName = "multi-sync"  # of the workers: in step, each for itself, or on Ray's machines
-    device: str = "cpu"  # where policy and critic live: cpu, cuda, cuda:1, ...
-    out: Path | None = None  # run folder, new or empty; unless given runs/<task>-<algorithm>-<date>-<time>
-    evaluation_episodes: int = 20  # episodes of the final evaluation, for each learner
-    checkpoint_interval: float = 60.0  # s between checkpoints; changes no result
-    logger: LoggerName = "tensorboard"  # of the curves, beside metrics.csv; csv writes that table alone
-
-    def __post_init__(self) -> None:
-        """Refuse what no run can start with."""
-        for name in ("learners", "num_envs", "threads", "evaluation_episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if self.workers < 0 or (self.workers and self.num_envs % self.workers):
-            raise ValueError(f"workers must divide num_envs, {self.num_envs}, or be 0, but is {self.workers}")
-        if self.seed < 0:
-            raise ValueError(f"seed must not be negative, but is {self.seed}")
-        if not self.checkpoint_interval >= 0:
-            raise ValueError(f"checkpoint_interval must not be negative, but is {self.checkpoint_interval}")
-        if self.collector != "multi-sync" and not self.workers:
-            raise ValueError(f"collector {self.collector} needs workers: say how many by --workers")
 
 
 class Options(Protocol):
@@ -152,12 +120,13 @@ def main(arguments: list[str]) -> int:
     """Run the command line; return the exit code: 0, 1 for a failed run, 2 for an error of the user, 130."""
     torchrl_logger.setLevel("WARNING")  # it tells of buffers on standard output
     try:
-        name, options = parse(arguments)
-        if name in ALGORITHMS:
-            start(name, options)
-        else:
-            _, command = COMMANDS[name]
-            command(options)
+        with unread_output_allowed():
+            name, options = parse(arguments)
+            if name in ALGORITHMS:
+                start(name, options)
+            else:
+                _, command = COMMANDS[name]
+                command(options)
     except (UserError, RunFailure) as error:
         print(f"train.py: {error}", file=sys.stderr)
         return 2 if isinstance(error, UserError) else 1
@@ -176,11 +145,10 @@ def start(name: str, options: Options) -> None:
     """Train, evaluate, and leave everything in a new run folder."""
     check_logger(options.run.logger)
     learner = build(name, options)
+    share_out(learner, options.run)
     folder = RunFolder(options.run.out) if options.run.out else RunFolder.named(options.run.task, name)
     folder.write_config({"algorithm": name, "run": options.run, "config": options.algorithm})
-    print(
-        f"{name} on {options.run.task}: {options.run.learners} learners, results in {folder.path}", flush=True
-    )
+    tell(f"{name} on {options.run.task}: {options.run.learners} learners, results in {folder.path}")
     with failures_of(learner, folder):
         learn(learner, options.run, folder)
         conclude(learner, options.run, folder)
@@ -188,9 +156,9 @@ def start(name: str, options: Options) -> None:
 
 def resume(options: ResumeOptions) -> None:
     """Take up a run from its checkpoint, or from its start if it has none yet."""
-    run = opened(options)
+    run = opened(options, trains=True)
     check_logger(run.options.logger)
-    print(f"going on after update {run.learner.updates} in {run.folder.path}", flush=True)
+    tell(f"going on after update {run.learner.updates} in {run.folder.path}")
     with failures_of(run.learner, run.folder):
         learn(run.learner, run.options, run.folder, resumed=True)
         conclude(run.learner, run.options, run.folder)
@@ -204,12 +172,14 @@ class Opened(NamedTuple):
     learner: Learner
 
 
-def opened(run: ARun) -> Opened:
+def opened(run: ARun, trains: bool = False) -> Opened:
     """The run of a folder, at an update or as late as there is a checkpoint."""
     folder = RunFolder.opened(run.folder)
     name, settings = COMMAND_LINE.settings_of(folder.config)
     options = parse([name, *settings])[1]
     learner = build(name, options)
+    if trains:
+        share_out(learner, options.run)
     checkpoints = Checkpoints(folder.checkpoints, learner=learner)
     file = checkpoints.latest() if run.checkpoint is None else checkpoints.at(run.checkpoint)
     if file is not None:
@@ -224,7 +194,10 @@ def build(name: str, options: Options) -> Learner:
     torch.manual_seed(options.run.seed)
     env = make_env(options.run, options.run.num_envs, options.run.seed)
     with mistakes_of_the_user():
-        return ALGORITHMS[name].learner(env, options.algorithm, seed=options.run.seed)
+        learner = ALGORITHMS[name].learner(env, options.algorithm, seed=options.run.seed)
+    if options.run.replay_storage == "disk" and learner.experience is None:
+        raise UserError("this learner uses each rollout once and keeps none: leave --replay-storage out")
+    return learner
 
 
 def make_env(options: RunOptions, num_envs: int, seed: int) -> Any:  # noqa: ANN401  (TorchRL's EnvBase and more)
@@ -242,6 +215,8 @@ def make_env(options: RunOptions, num_envs: int, seed: int) -> Any:  # noqa: ANN
 
 def learn(learner: Learner, options: RunOptions, folder: RunFolder, resumed: bool = False) -> None:
     """Train to the end or to the first Ctrl-C, recording every update."""
+    if options.replay_storage == "disk" and learner.experience is not None:
+        learner.experience.keep_in(folder.experience)
     checkpoints = Checkpoints(folder.checkpoints, learner=learner)
     after = learner.updates if resumed else None
     metrics = MetricsWriter(folder.metrics, folder.curves(options.logger), options.logger, after)
@@ -249,7 +224,7 @@ def learn(learner: Learner, options: RunOptions, folder: RunFolder, resumed: boo
     saved = -math.inf  # s; the first update is saved, so that a failure leaves something to go on from
     with (
         contextlib.closing(metrics),
-        collecting(learner, options),
+        contextlib.closing(learner.collection),
         StopRequest() as stop,
         Progress(learner.config.total_frames, title, before=learner.frames) as progress,
     ):
@@ -264,14 +239,12 @@ def learn(learner: Learner, options: RunOptions, folder: RunFolder, resumed: boo
                 break
         checkpoints.save(learner.updates)
     if stop.asked:
-        print(f"stopped after {learner.frames} environment steps per learner", flush=True)
+        tell(f"stopped after {learner.frames} environment steps per learner")
 
 
-@contextlib.contextmanager
-def collecting(learner: Learner, options: RunOptions) -> Iterator[None]:
-    """Within it the learner's experience comes from as many processes as asked for."""
+def share_out(learner: Learner, options: RunOptions) -> None:
+    """Let the learner's experience come from as many processes as asked for, once it begins to train."""
     if not options.workers:
-        yield
         return
     if not isinstance(learner.critic, torch.nn.Module):
         raise UserError("this learner's plan does not travel to other processes; leave --workers out")
@@ -287,18 +260,16 @@ def collecting(learner: Learner, options: RunOptions) -> Iterator[None]:
         else:
             workers = WorkerCollection(*given, asynchronous=alone)
     learner.collection = workers  # pyright: ignore[reportAttributeAccessIssue]
-    with contextlib.closing(workers):
-        yield
 
 
 def conclude(learner: Learner, options: RunOptions, folder: RunFolder) -> None:
     """Evaluate what was learned, draw it, and put it all on one page."""
     returns = evaluate(make_env(options, options.evaluation_episodes, EVALUATION_SEED), learner.policy)
     folder.write_evaluation(returns)
-    print(summary(returns), flush=True)
+    tell(summary(returns))
     draw(learner, options, folder, best=int(returns.mean(dim=1).argmax()))
     write_report(folder)
-    print(f"everything is in {folder.path}", flush=True)
+    tell(f"everything is in {folder.path}")
 
 
 def draw(learner: Learner, options: RunOptions, folder: RunFolder, best: int) -> None:
@@ -327,8 +298,8 @@ def evaluate_run(options: EvaluateOptions) -> None:
     run = opened(options)
     returns = evaluate(make_env(run.options, options.episodes, options.seed), run.learner.policy)
     for learner, value in enumerate(returns.mean(dim=1).tolist()):
-        print(f"learner {learner}: mean return {value:.2f}")
-    print(f"after update {run.learner.updates}: {summary(returns)}")
+        tell(f"learner {learner}: mean return {value:.2f}")
+    tell(f"after update {run.learner.updates}: {summary(returns)}")
 
 
 def render(options: RenderOptions) -> None:
@@ -343,7 +314,7 @@ def render(options: RenderOptions) -> None:
     path = options.out or run.folder.videos / f"learner-{learner}.mp4"
     env = make_env(run.options, num_envs=1, seed=options.seed)
     write_video(path, film(env, run.learner.policy, learner, LONGEST_FILM), round(1 / env.task.control_step))
-    print(path)
+    tell(path)
 
 
 def plot(options: PlotOptions) -> None:
@@ -358,7 +329,7 @@ def plot(options: PlotOptions) -> None:
         name = path.name if names.count(path.name) == 1 else str(path)
         curves[name] = recorded["frames"][:, 0], recorded[options.metric]
     save_figure(compare_curves(curves, options.metric), options.out)
-    print(options.out)
+    tell(options.out)
 
 
 def report(options: ReportOptions) -> None:
@@ -371,8 +342,8 @@ def list_tasks(options: TasksOptions) -> None:
     """Print the tasks, a line each, and where they are pictured."""
     for task in envs.ALL.values():
         about = (type(task).__doc__ or "").splitlines()[0]
-        print(f"{task.id:26s}{about} {task.horizon} steps of {task.control_step:g} s")
-    print(f"pictures: {PICTURES}")
+        tell(f"{task.id:26s}{about} {task.horizon} steps of {task.control_step:g} s")
+    tell(f"pictures: {PICTURES}")
 
 
 COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {

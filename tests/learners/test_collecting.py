@@ -81,8 +81,9 @@ def test_the_environments_own_transforms_are_saved_too():
 def test_nothing_was_carried_before_the_first_rollout():
     collection = Collection(pendulums(), proportional(), STEPS)
     assert collection.state_dict() == {}
-    collection.load_state_dict({})
-    assert collection.rollout()["step_count"][..., 0, 0].eq(0).all()
+    for state in ({}, {"workers": [{"simulation": {}}]}):  # the second is of a collection by processes
+        collection.load_state_dict(state)
+        assert collection.rollout()["step_count"][..., 0, 0].eq(0).all()
 
 
 class Broken(EnvBase):

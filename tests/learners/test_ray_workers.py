@@ -16,7 +16,8 @@ import envs
 from torch_gprl.critics import GPActionValue
 from torch_gprl.gp import SparseOnlineGP
 from torch_gprl.kernels import SquaredExponential
-from torch_gprl.learners.ray_workers import CarriedPolicy, RayCollection
+from torch_gprl.learners.ray_workers import CarriedPolicy, RayCollection, RayWorker
+from torch_gprl.learners.workers import made
 from torch_gprl.policies import ConfidenceNoise
 from torch_gprl.policies.streams import NoiseStream
 
@@ -92,6 +93,42 @@ def test_a_worker_that_fails_tells_why():
         pytest.raises(RuntimeError, match=r"(?s)a worker failed.*no simulator"),
     ):
         collection.rollout()
+
+
+def a_worker(carried: CarriedPolicy, seed: int) -> RayWorker:
+    """What one of Ray's processes runs, here."""
+    return RayWorker(
+        functools.partial(made, functools.partial(pendulums, seed)),
+        copy.deepcopy(carried),
+        worker=seed,
+        frames_per_batch=STEPS * LEARNERS * ENVS,
+        total_frames=-1,
+        auto_register_policy_transforms=False,
+    )
+
+
+def test_a_worker_goes_on_bit_for_bit_from_a_saved_state():
+    policy, critic = scene()
+    modules = nn.ModuleDict({"policy": policy, "critic": critic})
+    carried, resumed = CarriedPolicy(modules), CarriedPolicy(modules)
+    learn(critic)
+    carried.mark()
+    one = a_worker(carried, 0)
+    rollouts = iter(one)
+    next(rollouts)
+    state = one.state_dict()
+    learn(critic)
+    carried.mark(), resumed.mark()  # in a resumed run the versions begin anew
+    other = a_worker(resumed, 1)
+    other.load_state_dict(state)
+    for worker, learned in ((one, carried), (other, resumed)):
+        TensorDict.from_module(worker.policy).data.update_(TensorDict.from_module(learned).data)
+    for expected, came in zip(rollouts, other, strict=False):
+        for key in ("observation", "action", "action_std", ("next", "reward")):
+            assert torch.equal(expected[key], came[key])
+        torch.testing.assert_close(came["action_std"], policy(came.select("observation"))["action_std"])
+        if one._iter == 3:
+            break
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from torch_gprl.gp import SparseOnlineGP
 from torch_gprl.kernels import SquaredExponential
 from torch_gprl.learners import PolicyGradient, PolicyGradientConfig, QLearning, QLearningConfig
 from torch_gprl.learners.board import PLAIN, Board, FollowingPolicy
-from torch_gprl.learners.workers import WorkerCollection, copied_for_workers
+from torch_gprl.learners.workers import ReportingCollector, WorkerCollection, copied_for_workers, made
 from torch_gprl.policies import ConfidenceNoise, GaussianPolicy, LinearController, gaussian_policy
 from torch_gprl.policies.streams import NoiseStream
 
@@ -92,6 +92,21 @@ def test_a_worker_takes_up_what_is_annealed(tmp_path: Path):
     torch.testing.assert_close(acted[0], acted[1])  # without noise
 
 
+def test_a_worker_keeps_the_functions_that_its_episodes_act_on(tmp_path: Path):
+    learner = QLearning(pendulums(0), QLearningConfig(exploration="thompson", budget=20))
+    modules = nn.ModuleDict({"policy": learner.policy, "critic": learner.critic})
+    learner.policy.uniform = False
+    board, (copied,) = Board(tmp_path), copied_for_workers(modules, 1)
+    board.post(modules)
+    worker = FollowingPolicy(copied, tmp_path)
+    state = pendulums(0).reset().set("step_count", torch.zeros(LEARNERS, ENVS, 1, dtype=torch.long))
+    first = worker(state.clone())["action"]
+    board.post(modules)  # news, of the same content
+    middle = worker(state.clone().set("step_count", torch.ones(LEARNERS, ENVS, 1, dtype=torch.long)))
+    assert torch.equal(middle["action"], first)
+    assert not torch.equal(worker(state.clone())["action"], first)  # another episode
+
+
 def test_half_of_a_change_is_not_read(tmp_path: Path):
     modules = nn.ModuleDict({"policy": nn.Linear(2, 2)})
     writer, reader = Board(tmp_path), Board(tmp_path)
@@ -120,6 +135,46 @@ def test_workers_draw_numbers_of_their_own():
             assert not (actions[one] == actions[other]).any()
     again = copied_for_workers(nn.ModuleDict({"policy": gaussian()}), 2)
     assert torch.equal(again[1]["policy"](seen.clone())["action"], actions[1])
+
+
+def a_worker(folder: Path, seed: int) -> ReportingCollector:
+    """What a process of synchronous workers runs, here."""
+    critic = taught_critic(1.0)
+    modules = nn.ModuleDict({"policy": exploring(critic), "critic": critic})
+    Board(folder / "board").post(modules)
+    (copied,) = copied_for_workers(modules, 1)
+    return ReportingCollector(
+        functools.partial(made, functools.partial(pendulums, seed)),
+        FollowingPolicy(copied, folder / "board"),
+        frames_per_batch=STEPS * LEARNERS * ENVS,
+        total_frames=-1,
+        auto_register_policy_transforms=False,
+        reports=folder,
+    )
+
+
+def test_a_worker_goes_on_bit_for_bit_from_a_saved_state(tmp_path: Path):
+    torch.manual_seed(0)
+    one, other = (a_worker(tmp_path / name, seed) for seed, name in enumerate("ab"))
+    rollouts = iter(one)
+    next(rollouts), next(iter(other))
+    other.load_state_dict(one.state_dict())
+    for expected, came in zip(rollouts, other, strict=False):
+        for key in ("observation", "action", "action_std", "step_count", ("next", "reward")):
+            assert torch.equal(expected[key], came[key])
+        if one._iter == 4:
+            break
+
+
+def test_workers_go_on_only_from_as_many_workers():
+    factories = [functools.partial(pendulums, seed) for seed in range(2)]
+    collection = WorkerCollection(factories, gaussian(), STEPS)
+    for count in (1, 2, 3):
+        workers = [{"simulation": {}}] * count
+        collection.load_state_dict({"workers": workers})
+        assert collection.state_dict() == {"workers": workers if count == 2 else []}
+    collection.load_state_dict({"simulation": {"of": torch.zeros(1)}})  # of a collection in one process
+    assert collection.state_dict() == {"workers": []}
 
 
 def test_workers_need_factories():
@@ -191,6 +246,22 @@ def test_a_learner_learns_from_synchronous_workers_and_repeats_itself():
             figures.append(torch.stack([row["gradient_norm"] for row in learner.train()]))
     assert figures[0].isfinite().all()
     assert torch.equal(figures[0], figures[1])
+
+
+@pytest.mark.slow
+def test_a_resumed_learner_with_synchronous_workers_goes_on_bit_for_bit(tmp_path: Path):
+    factories = [functools.partial(pendulums, seed) for seed in range(2)]
+    learner, rows = learner_with(factories, asynchronous=False), []
+    with contextlib.closing(learner.collection):
+        for figures in learner.train():
+            rows.append(figures["gradient_norm"])
+            if learner.updates == 2:
+                torch.save(learner.state_dict(), tmp_path / "state.pt")
+    other = learner_with(factories, asynchronous=False)
+    other.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    with contextlib.closing(other.collection):
+        again = [figures["gradient_norm"] for figures in other.train()]
+    assert torch.equal(torch.stack(rows[2:]), torch.stack(again))
 
 
 @pytest.mark.slow

@@ -79,14 +79,19 @@ class FollowingPolicy(TensorDictModuleBase):
 
 
 def content_of(modules: nn.Module) -> dict[str, Tensor]:
-    """All that actions may depend on: tensors, and plain public numbers such as annealed widths."""
+    """All that actions may depend on: tensors, and plain public numbers such as annealed widths.
+
+    What modules save beside tensors belongs to one process, such as the functions that its episodes act on.
+    """
     numbers = [float(getattr(module, name)) for module, name in _plain(modules)]
-    return {**modules.state_dict(), PLAIN: torch.tensor(numbers, dtype=torch.float64)}
+    tensors = {name: value for name, value in modules.state_dict().items() if isinstance(value, Tensor)}
+    return {**tensors, PLAIN: torch.tensor(numbers, dtype=torch.float64)}
 
 
 def take_up(modules: nn.Module, content: dict[str, Tensor]) -> None:
     """Give copies of modules the content of the originals."""
-    modules.load_state_dict({name: tensor for name, tensor in content.items() if name != PLAIN})
+    tensors = {name: tensor for name, tensor in content.items() if name != PLAIN}
+    modules.load_state_dict({**modules.state_dict(), **tensors})
     for (module, name), number in zip(_plain(modules), content[PLAIN].tolist(), strict=True):
         kind = type(getattr(module, name))
         setattr(module, name, kind(number))

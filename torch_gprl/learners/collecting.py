@@ -1,7 +1,8 @@
 """Experience for learners: rollouts that go on where the last one ended, in another process too.
 
 TorchRL's `Collector` carries the environment's present state from rollout to rollout, but does not save it.
-`Collection` does, together with the simulation, so that a resumed run continues bit for bit.
+`Collection` does, together with the simulation, so that a resumed run continues bit for bit; collections by
+several processes do so by the same two functions.
 """
 
 import math
@@ -57,24 +58,39 @@ class Collection:
 
     def state_dict(self) -> dict[str, Any]:
         """The simulation and what it carries into the next step: tensors and plain numbers."""
-        if self._collector is None:
-            return {}
-        return {
-            "simulation": _simulation(self.env).state_dict(),
-            "transforms": self._collector.env.state_dict(),
-            # TorchRL has no public name for the observations and counters before the next step.
-            "carried": self._collector._carrier.to_dict(),
-        }
+        return {} if self._collector is None else state_of(self._collector)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what `state_dict` gave; tries the policy, so restore its random numbers after this."""
+        """Take up what `state_dict` gave; tries the policy, so restore its random numbers after this.
+
+        The state of a collection by several processes begins new episodes here.
+        """
         self._collector = None
-        if not state or not state["simulation"]:
-            return
-        collector = self._start()
-        _simulation(self.env).load_state_dict(state["simulation"])
-        collector.env.load_state_dict(state["transforms"])
-        collector._carrier.update(TensorDict(state["carried"], self.env.batch_size).to(self.env.device))
+        if state.get("simulation"):
+            restore(self._start(), state)
+
+    def close(self) -> None:
+        """Nothing: all is in this process."""
+
+
+def state_of(collector: Collector) -> dict[str, Any]:
+    """A collector's simulation, and what it carries into the next step: tensors and plain numbers."""
+    return {
+        "simulation": _simulation(collector.env).state_dict(),
+        "transforms": collector.env.state_dict(),
+        # TorchRL has no public name for the observations and counters before the next step.
+        "carried": collector._carrier.to_dict(),
+    }
+
+
+def restore(collector: Collector, state: dict[str, Any]) -> None:
+    """Let a collector go on from what `state_of` gave, unless its simulation saves nothing."""
+    if not state["simulation"]:
+        return
+    simulation = _simulation(collector.env)
+    simulation.load_state_dict(state["simulation"])
+    collector.env.load_state_dict(state["transforms"])
+    collector._carrier.update(TensorDict(state["carried"], simulation.batch_size).to(simulation.device))
 
 
 def _simulation(env: EnvBase) -> EnvBase:

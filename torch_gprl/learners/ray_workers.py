@@ -4,20 +4,21 @@ Needs the extra `ray`. Connect to a cluster by `ray.init(address="auto")` before
 machine. TorchRL carries the tensors; `CarriedPolicy` then lets a Gaussian process know that it has changed.
 """
 
+import contextlib
 import functools
 import importlib.util
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from torch_gprl.learners.board import PLAIN, content_of, take_up
-from torch_gprl.learners.workers import made, streams_of
+from torch_gprl.learners.worker_state import ResumableCollector, packed, streams_of, unpacked
+from torch_gprl.learners.workers import made
 
 ENDLESS = 2**62  # frames: TorchRL's own default stops Ray's collector at once
 
@@ -25,8 +26,8 @@ ENDLESS = 2**62  # frames: TorchRL's own default stops Ray's collector at once
 class RayCollection:
     """Rollouts [learners, envs, T] whose environments Ray's workers share out; see `Collection`.
 
-    Synchronous: all of a rollout is made by the policy of the moment. Environments of workers are not saved,
-    a resumed run begins new episodes.
+    Synchronous: all of a rollout is made by the policy of the moment. A resumed run continues bit for bit, if
+    it gets this collection before it loads its state.
 
     Args:
         factories: one for each worker, makes its environment of batch [learners, envs of this worker].
@@ -62,6 +63,7 @@ class RayCollection:
         modules = {"policy": policy} if critic is None else {"policy": policy, "critic": critic}
         self._carried = CarriedPolicy(nn.ModuleDict(modules))
         self._collector: Any = None
+        self._resumed: list[dict[str, Any]] = []  # what each worker goes on from
 
     def rollout(self) -> TensorDictBase:
         """The next T steps, after the workers have been told of today's policy.
@@ -70,26 +72,20 @@ class RayCollection:
             RuntimeError: a worker failed; the message tells why. The learner's state is unharmed.
         """
         self._carried.mark()
-        try:
+        with self._failures_told():
             if self._collector is None:
-                self._start()
-            else:
-                self._collector.update_policy_weights_()
+                self._collector = self._started()
+            self._collector.update_policy_weights_()
             rollout = next(self._rollouts)
-        except Exception as error:
-            raise RuntimeError(
-                f"a worker failed: {error}. What was learned until now is unharmed: save it, or go on from "
-                "the last checkpoint"
-            ) from error
         return rollout.movedim(0, 1).flatten(1, 2)  # environments side by side
 
-    def _start(self) -> None:
-        from torchrl.collectors.distributed import RayCollector  # imports ray
+    def _started(self) -> Any:  # noqa: ANN401  (TorchRL's collector; importing it imports ray)
+        from torchrl.collectors.distributed import RayCollector
 
         sample, workers = self.factories[0](), len(self.factories)
         frames = self.steps * sample.batch_size.numel() * workers
         sample.close()
-        self._collector = RayCollector(
+        collector = RayCollector(
             [functools.partial(made, factory) for factory in self.factories],
             self._carried,
             frames_per_batch=frames,
@@ -102,19 +98,45 @@ class RayCollection:
             remote_configs={"num_cpus": self.cpus, "num_gpus": 0},
             ray_init_config=self.ray_options,
         )
-        self._rollouts = iter(self._collector)
+        if self._resumed:
+            collector.load_state_dict([packed(state) for state in self._resumed])
+            self._resumed = []
+        self._rollouts = iter(collector)
+        return collector
+
+    @contextlib.contextmanager
+    def _failures_told(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            self.close()
+            raise RuntimeError(
+                f"a worker failed: {error}. What was learned until now is unharmed: save it, or go on from "
+                "the last checkpoint"
+            ) from error
 
     def close(self) -> None:
         """End the workers."""
         if self._collector is not None:
             self._collector.shutdown()
+        self._collector = None
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing: the workers' simulations are theirs."""
-        return {}
+        """Where the workers stand: tensors and plain numbers; nothing once they have ended.
+
+        Raises:
+            RuntimeError: a worker failed; the message tells why.
+        """
+        if self._collector is None:
+            return {"workers": self._resumed}
+        with self._failures_told():
+            return {"workers": [unpacked(state) for state in self._collector.state_dict()]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Begin new episodes, whatever collection the state came from."""
+        """Go on from what `state_dict` gave; from new episodes, if another collection did."""
+        self.close()
+        workers = state.get("workers", [])
+        self._resumed = workers if len(workers) == len(self.factories) else []
 
 
 class CarriedPolicy(TensorDictModuleBase):
@@ -154,13 +176,13 @@ class CarriedPolicy(TensorDictModuleBase):
         """Act; a version that has just arrived is first taken up as a whole."""
         if int(self.version) != self.seen:
             self.seen = int(self.version)
-            content = {name: tensor.clone() for name, tensor in self.carried.state_dict().items()}
+            content = {name: tensor.clone() for name, tensor in content_of(self.carried).items()}
             take_up(self.carried, content | {PLAIN: self.numbers})
         policy = self.carried["policy"]
         return policy(tensordict)
 
 
-class RayWorker(Collector):
+class RayWorker(ResumableCollector):
     """A worker's collector, with random numbers of its own."""
 
     def __init__(

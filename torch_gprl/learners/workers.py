@@ -4,14 +4,16 @@
         learner.collection = workers
         for figures in learner.train(): ...
 
-How policy and critic reach them is told in `board`.
+How policy and critic reach them is told in `board`, how their state comes back in `worker_state`.
 """
 
+import contextlib
 import copy
 import functools
 import signal
 import tempfile
-from collections.abc import Callable, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -20,13 +22,13 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
-from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.collectors import MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import EnvBase
 from torchrl.weight_update import NoWeightSyncScheme
 
 from torch_gprl.learners.board import Board, FollowingPolicy
 from torch_gprl.learners.collecting import watched
-from torch_gprl.policies.streams import NoiseStream
+from torch_gprl.learners.worker_state import ResumableCollector, packed, streams_of, unpacked
 
 
 class WorkerCollection:
@@ -36,9 +38,10 @@ class WorkerCollection:
     Asynchronous ones make whole rollouts in turn while the learner learns: a rollout may have been begun
     under an older policy. Workers take up a new policy between two steps.
 
-    Environments of workers are not saved, a resumed run begins new episodes. Every worker has random numbers
-    of its own, drawn from the policy's streams: a run repeats itself if it is synchronous and keeps its
-    number of workers. Scripts that use workers need the guard `if __name__ == "__main__"`.
+    Every worker has random numbers of its own, drawn from the policy's streams. Synchronous workers repeat
+    themselves if their number stays, and save their simulations: a resumed run continues bit for bit, if it
+    gets this collection before it loads its state. Asynchronous ones begin new episodes. Scripts that use
+    workers need the guard `if __name__ == "__main__"`.
 
     Args:
         factories: one for each worker, makes its environment of batch [learners, envs of this worker].
@@ -64,9 +67,10 @@ class WorkerCollection:
         self.factories, self.steps, self.asynchronous = list(factories), steps, asynchronous
         modules = {"policy": policy} if critic is None else {"policy": policy, "critic": critic}
         self._followed = nn.ModuleDict(modules)
-        self._folder = tempfile.TemporaryDirectory(prefix="torch-gprl-")
-        self._board = Board(Path(self._folder.name) / "board")
+        self._copies = copied_for_workers(self._followed, len(self.factories))
         self._collector: MultiSyncCollector | MultiAsyncCollector | None = None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None  # of the board, and of what failures say
+        self._resumed: list[dict[str, Any]] = []  # what each worker goes on from
 
     def rollout(self) -> TensorDictBase:
         """The next T steps, after the workers have been told of today's policy.
@@ -74,31 +78,31 @@ class WorkerCollection:
         Raises:
             RuntimeError: a worker failed; the message tells why. The learner's state is unharmed.
         """
-        self._board.post(self._followed)
-        if self._collector is None:
-            self._start()
-        try:
+        with self._failures_told():
+            if self._collector is None:
+                self._start()
+            self._board.post(self._followed)
             return next(self._rollouts)
-        except Exception as error:  # TorchRL may fail in ending the other workers
-            raise RuntimeError(
-                f"a worker failed: {self._cause() or error}. What was learned until now is unharmed: "
-                "save it, or go on from the last checkpoint"
-            ) from error
 
     def _start(self) -> None:
+        """Start the workers, from where they stood if there is something to resume."""
+        self._folder = tempfile.TemporaryDirectory(prefix="torch-gprl-")
         folder = Path(self._folder.name)
-        modules = copied_for_workers(self._followed, len(self.factories))
+        self._board = Board(folder / "board")
+        self._board.post(self._followed)  # workers try the policy before the first rollout
         sample = self.factories[0]()
         frames = self.steps * sample.batch_size.numel()
         sample.close()
         kind: type[MultiSyncCollector | MultiAsyncCollector] = MultiAsyncCollector
         options: dict[str, Any] = {}
         if not self.asynchronous:
-            kind, frames = MultiSyncCollector, frames * len(modules)
+            kind, frames = MultiSyncCollector, frames * len(self._copies)
             options = {"cat_results": 1}  # environments side by side
         self._collector = kind(
             [functools.partial(made, factory) for factory in self.factories],
-            policy_factory=[functools.partial(FollowingPolicy, part, self._board.folder) for part in modules],
+            policy_factory=[
+                functools.partial(FollowingPolicy, part, folder / "board") for part in self._copies
+            ],
             frames_per_batch=frames,
             total_frames=-1,
             weight_sync_schemes={"policy": NoWeightSyncScheme()},
@@ -107,32 +111,62 @@ class WorkerCollection:
             collector_class=functools.partial(ReportingCollector, reports=folder),
             **options,
         )
+        if self._resumed:
+            workers = {f"worker{i}": packed(state) for i, state in enumerate(self._resumed)}
+            self._collector.load_state_dict(OrderedDict(**workers, frames=0, iter=0))
+            self._resumed = []
         self._rollouts = iter(self._collector)
+
+    @contextlib.contextmanager
+    def _failures_told(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # TorchRL may fail in ending the other workers
+            cause = self._cause() or error
+            self.close()
+            raise RuntimeError(
+                f"a worker failed: {cause}. What was learned until now is unharmed: "
+                "save it, or go on from the last checkpoint"
+            ) from error
 
     def _cause(self) -> str:
         """What failed workers have left word of, or how they ended."""
-        reports = sorted(Path(self._folder.name).glob("worker-*.txt"))
+        reports = sorted(Path(self._folder.name).glob("worker-*.txt")) if self._folder else []
         if reports:
             return "; ".join(f"{path.stem}: {path.read_text(encoding='utf-8')}" for path in reports)
-        assert self._collector is not None
-        codes = enumerate(map(_exit_code, self._collector.procs))
+        codes = enumerate(map(_exit_code, self._collector.procs if self._collector else []))
         return "; ".join(f"worker-{i} ended with exit code {code}" for i, code in codes if code)
 
     def close(self) -> None:
         """End the workers."""
         if self._collector is not None:
             self._collector.shutdown(raise_on_error=False)
-        self._folder.cleanup()
+        if self._folder is not None:
+            self._folder.cleanup()
+        self._collector = self._folder = None
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing: the workers' simulations are theirs."""
-        return {}
+        """Where synchronous workers stand: tensors and plain numbers; nothing once they have ended.
+
+        Raises:
+            RuntimeError: a worker failed; the message tells why.
+        """
+        if self.asynchronous:
+            return {}
+        if self._collector is None:
+            return {"workers": self._resumed}
+        with self._failures_told():
+            state = self._collector.state_dict()
+        return {"workers": [unpacked(state[f"worker{i}"]) for i in range(len(self.factories))]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Begin new episodes, whatever collection the state came from."""
+        """Go on from what `state_dict` gave; from new episodes, if another collection did."""
+        self.close()
+        workers = state.get("workers", [])
+        self._resumed = workers if len(workers) == len(self.factories) else []
 
 
-class ReportingCollector(Collector):
+class ReportingCollector(ResumableCollector):
     """A worker's collector, which leaves the cause in a file when it fails; TorchRL prints it at most."""
 
     def __init__(self, *args: Any, reports: Path, worker_idx: int | None = None, **options: Any) -> None:  # noqa: ANN401
@@ -156,11 +190,6 @@ def copied_for_workers(modules: nn.ModuleDict, count: int) -> list[nn.ModuleDict
             for part, own in zip(parts, stream.split(count), strict=True):
                 setattr(part, name, own)
     return copies
-
-
-def streams_of(module: nn.Module) -> list[tuple[str, NoiseStream]]:
-    """The streams of random numbers that a module itself holds, by name."""
-    return [(name, value) for name, value in vars(module).items() if isinstance(value, NoiseStream)]
 
 
 def _leave_interrupts_to_the_learner() -> None:

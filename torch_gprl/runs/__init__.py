@@ -15,6 +15,7 @@ from torch_gprl.runs.foresight import foresee, foresight_figure
 from torch_gprl.runs.graph_figure import graph_figure, save_graph
 from torch_gprl.runs.intervals import bootstrap_interval
 from torch_gprl.runs.metrics import MetricsWriter, read_metrics
+from torch_gprl.runs.output import tell, unread_output_allowed
 from torch_gprl.runs.progress import Progress
 from torch_gprl.runs.report import write_report
 from torch_gprl.runs.stopping import StopRequest
@@ -49,6 +50,8 @@ __all__ = [
     "save_figure",
     "save_graph",
     "summary",
+    "tell",
+    "unread_output_allowed",
     "value_on_plane",
     "value_surface",
     "write_report",

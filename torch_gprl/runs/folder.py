@@ -6,6 +6,7 @@
       evaluation.csv     one row per learner and episode of the final evaluation
       tensorboard/       the same numbers as TensorBoard events, or what another logger writes
       checkpoints/       the last two states
+      experience/        transitions in mapped files, if they were to be kept there
       figures/  videos/
       report.html        all of it on one page
       failure.txt        what ended the run, if something did
@@ -98,6 +99,11 @@ class RunFolder:
     def checkpoints(self) -> Path:
         """The folder of the checkpoints."""
         return self.path / "checkpoints"
+
+    @property
+    def experience(self) -> Path:
+        """The folder of the experience that is kept in files."""
+        return self.path / "experience"
 
     @property
     def figures(self) -> Path:

@@ -15,6 +15,14 @@ PLAIN_INTERVAL = 5.0  # s between lines where there is no terminal
 SHOWN = {"return": "return", "sigma": "σ", "basis_size": "basis"}  # metric -> label
 
 
+class PatientConsole(Console):
+    """A console that nobody has to read to the end, as behind `2>&1 | head`; rich's own would end the run."""
+
+    def on_broken_pipe(self) -> None:
+        """Fall silent."""
+        self.quiet = True
+
+
 class Progress:
     """Shows the state of a run; use as a context manager.
 
@@ -36,7 +44,7 @@ class Progress:
     ) -> None:
         self._total_frames, self._before = total_frames, before
         self._title = title
-        self._console = console or Console(stderr=True)
+        self._console = console or PatientConsole(stderr=True)
         self._clock = clock
         self._live = Live(console=self._console, auto_refresh=False)
         self._start = self._last_line = clock()

@@ -86,6 +86,9 @@ class PlannedValue:
         high: upper bounds.
         planning: the numbers.
         acting_actions: actions compared when acting.
+
+    Attributes:
+        acting_actions: those actions [J, A], in halves of the actuator's range.
     """
 
     def __init__(
@@ -94,7 +97,7 @@ class PlannedValue:
         self.model, self.planning = model, planning
         self._centre, self._half = (low + high) / 2, (high - low) / 2
         self._backup_actions = self._candidates(low, high, planning.backup_actions)
-        self._acting_actions = self._candidates(low, high, acting_actions)
+        self.acting_actions = self._candidates(low, high, acting_actions)
         self._support: _Support | None = None
 
     def _candidates(self, low: Tensor, high: Tensor, count: int) -> Tensor:
@@ -273,18 +276,34 @@ class PlannedValue:
         unknown = self._unknown(step.observation, step.doubt, lasting)[..., EXPLORE]
         return torch.lerp(value, self._hope.expand_as(value), unknown)
 
-    @torch.no_grad()
     def best_action(self, observation: Float[Tensor, "L N S"], explore: bool) -> Float[Tensor, "L N A"]:
         """The best of the candidate actions, in halves of the actuator's range."""
-        actions, trembling = self._acting_actions, self._trembling(self._acting_actions)
+        return self.acting_actions[self.candidate_values(observation, explore).argmax(-1)]
+
+    @torch.no_grad()
+    def candidate_values(self, observation: Float[Tensor, "L N S"], explore: bool) -> Float[Tensor, "L N J"]:
+        """The values of all candidate actions, each averaged over actions near it."""
+        actions, trembling = self.acting_actions, self._trembling(self.acting_actions)
         each = len(observation) * len(actions) * (self.model.budget + self.planning.support)
-        best = []
+        values = []
         for some in observation.split(max(1, CHUNK // each), 1):
             spread = some.repeat_interleave(len(actions), 1)
             tried = actions.repeat(some.shape[1], 1).expand(len(some), -1, -1)
             value = self.action_values(spread, tried, explore)
-            best.append(actions[(value.unflatten(1, (some.shape[1], -1)) @ trembling.mT).argmax(-1)])
-        return torch.cat(best, 1)
+            values.append(value.unflatten(1, (some.shape[1], -1)) @ trembling.mT)
+        return torch.cat(values, 1)
+
+    def unknown(
+        self, observation: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"]
+    ) -> Float[Tensor, "L N"]:
+        """The share, 0 to 1, of what actions lead to that the experience says nothing about.
+
+        Args:
+            observation: the states.
+            action: in halves of the actuator's range.
+        """
+        step = self.model.predict(observation, action)
+        return torch.maximum(step.doubt, self._novelty(step.observation))
 
     def value(self, observation: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"]) -> Posterior:
         """Action values [L, N] of actions in the actuator's units, in units of the return.
@@ -294,9 +313,7 @@ class PlannedValue:
         observation = observation.to(self.model.loc.dtype)
         share = (action.to(observation) - self._centre) / self._half
         mean = self.action_values(observation, share, explore=False)
-        step = self.model.predict(observation, share)
-        unknown = torch.maximum(step.doubt, self._novelty(step.observation))
-        return Posterior(mean, unknown * (self._high - self._low).square())
+        return Posterior(mean, self.unknown(observation, share) * (self._high - self._low).square())
 
     def basis_points(self, learner: int) -> Float[Tensor, "M S"]:
         """The support states of a learner, as observations."""

@@ -1,17 +1,16 @@
 """Dynamic programming on Gaussian-process models: the learner for the least experience.
 
-One update: act for a rollout on the plan that is optimistic about what is unknown, add it to the experience,
-and, when that has grown enough, learn the model and plan anew. All learners at once, each on its own
-experience. Model-based: where the other learners estimate values from the rewards that followed, this one
-learns what each step does and computes what follows (Deisenroth, Rasmussen and Peters, 2009).
+One update: act for a rollout on the plan, hopefully about what is unknown unless told otherwise, add it to
+the experience, and, when that has grown enough, learn the model and plan anew. All learners at once, each on
+its own experience. Model-based: where the other learners estimate values from the rewards that followed,
+this one learns what each step does and computes what follows (Deisenroth, Rasmussen and Peters, 2009).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -21,64 +20,10 @@ from torch_gprl.learners.collecting import Collection, batch_of, mean_return
 from torch_gprl.learners.dynamic_programming_config import DynamicProgrammingConfig
 from torch_gprl.learners.experience import Experience
 from torch_gprl.learners.q_learning import action_box_of
-from torch_gprl.policies.gaussian import explores
-from torch_gprl.policies.streams import NoiseStream, learner_generators, stacked_normal
+from torch_gprl.policies import PlannedPolicy
+from torch_gprl.policies.streams import learner_generators, stacked_normal
 
-INERTIA = 0.8  # of the first, random actions: those that follow each other are alike, and move the robot
 REFIT_GROWTH = 2  # hyper-parameters are fitted whenever the experience has doubled
-
-
-class PlannedPolicy(TensorDictModuleBase):
-    """The best action of a plan, with a little noise; smooth random actions as long as there is none.
-
-    Reads `observation` [L, envs, S], writes `action`. Under TorchRL's `ExplorationType.DETERMINISTIC` it acts
-    on the plan that does not count on the unknown, without noise.
-
-    Args:
-        value: the plan.
-        low: lower bounds of the actions, [A].
-        high: upper bounds.
-        std: of the noise, in halves of the actuator's range.
-        seed: of the noise.
-        learners: indices of the learners' streams.
-    """
-
-    def __init__(
-        self, value: PlannedValue, low: Tensor, high: Tensor, std: float, seed: int, learners: Sequence[int]
-    ) -> None:
-        super().__init__()
-        self.in_keys, self.out_keys = ["observation"], ["action"]
-        self.std, self.noise = std, NoiseStream(seed, learners)
-        self._value, self._centre, self._half = value, (low + high) / 2, (high - low) / 2
-        self._last: Tensor | None = None
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
-        observation = tensordict.get("observation")
-        states = observation.to(self._half.dtype).reshape(len(observation), -1, observation.shape[-1])
-        share = self._share(states).reshape(*observation.shape[:-1], -1)
-        return tensordict.set("action", (self._centre + share * self._half).to(observation.dtype))
-
-    def _share(self, states: Tensor) -> Tensor:
-        nothing = states.new_zeros(*states.shape[:2], len(self._half))
-        if not explores():
-            return self._value.best_action(states, explore=False) if self._value.planned else nothing
-        noise = self.noise.draw(nothing)
-        if self._value.planned:
-            best = self._value.best_action(states, explore=True)
-            return torch.clamp(best + self.std * noise, -1, 1)
-        last = nothing if self._last is None else self._last
-        self._last = torch.clamp(INERTIA * last + (1 - INERTIA**2) ** 0.5 * noise, -1, 1)
-        return self._last
-
-    def state(self) -> dict[str, Any]:
-        """Where the noise stands, for `restore`."""
-        return {"noise": self.noise.state(), "last": self._last}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue where the noise stood."""
-        self.noise.restore(state["noise"])
-        self._last = state["last"]
 
 
 class DynamicProgramming:
@@ -101,7 +46,7 @@ class DynamicProgramming:
         indices = range(first_learner, first_learner + self.learners)
         self.model = TransitionModel(self.learners, states, len(low), config.model_budget)
         self.critic = PlannedValue(self.model, low, high, config.planning, config.acting_actions)
-        self.policy = PlannedPolicy(self.critic, low, high, config.std, seed, indices)
+        self.policy = PlannedPolicy(self.critic, low, high, config, seed, indices)
         self.collection = Collection(env, self.policy, config.rollout_steps)
         self.frames_per_update = num_envs * config.rollout_steps
         self.total_updates = -(-config.total_frames // self.frames_per_update)
@@ -120,6 +65,7 @@ class DynamicProgramming:
     def train(self) -> Iterator[dict[str, Tensor]]:
         """Run the remaining updates; yields figures of each, [learners] every one."""
         while self.updates < self.total_updates:
+            self.policy.anneal(self.updates / self.total_updates)
             rollout = self.collection.rollout()
             new = self._transitions(rollout)
             error = self._surprise(new)

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 from torch_gprl.critics.planned_value import Planning
+from torch_gprl.policies import PlannedBehaviour
 
 LEAST = {
     "total_frames": 1,
@@ -17,11 +18,11 @@ LEAST = {
     "acting_actions": 3,
 }
 POSITIVE = ("lengthscale", "novelty_lengthscale", "tremble")
-NOT_NEGATIVE = ("std", "optimism", "growth")
+NOT_NEGATIVE = ("optimism", "growth")
 
 
-@dataclass(frozen=True)
-class DynamicProgrammingConfig:
+@dataclass(frozen=True, kw_only=True)
+class DynamicProgrammingConfig(PlannedBehaviour):
     """Dynamic programming on Gaussian-process models of the steps and of the value."""
 
     total_frames: int = 2_000  # environment steps per learner, over all its environments
@@ -41,7 +42,6 @@ class DynamicProgrammingConfig:
     tremble: float = 0.25  # standard deviation of actions to plan for, in halves of the actuator's range
 
     optimism: float = 1.0  # exploring hopes for the best seen and so many ranges of value more
-    std: float = 0.1  # standard deviation of noise round the best action, in halves of the actuator's range
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range.
@@ -49,6 +49,7 @@ class DynamicProgrammingConfig:
         Raises:
             ValueError: naming the field, its value and what would be valid.
         """
+        super().__post_init__()
         for name, least in LEAST.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")

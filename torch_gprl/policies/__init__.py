@@ -12,6 +12,7 @@ from torch_gprl.policies.controllers import (
 from torch_gprl.policies.gaussian import GaussianPolicy, NormalPolicy, gaussian_policy
 from torch_gprl.policies.gibbs import GibbsConfig, GibbsPolicy
 from torch_gprl.policies.optimistic import ThompsonSampling, UpperConfidence
+from torch_gprl.policies.planned import PlannedBehaviour, PlannedPolicy, PlannedScheme
 from torch_gprl.policies.streams import NoiseStream
 
 __all__ = [
@@ -28,6 +29,9 @@ __all__ = [
     "MLPController",
     "NoiseStream",
     "NormalPolicy",
+    "PlannedBehaviour",
+    "PlannedPolicy",
+    "PlannedScheme",
     "RBFController",
     "ScaledController",
     "Scheme",

@@ -51,8 +51,12 @@ class ConfidenceScale:
         """σ(s) [*batch, A], in the actuator's units, at observations [*batch, S] and actions [*batch, A]."""
         low, high = action_box(critic)
         variance = critic.gp.posterior(critic.inputs(observation, action)).variance
-        std = (self.noise_scale * variance).clamp(self.floor**2, self.ceiling**2).sqrt()
-        return (std.reshape(observation.shape[:-1]).unsqueeze(-1) * (high - low) / 2).to(action.dtype)
+        share = self.share(variance).reshape(observation.shape[:-1]).unsqueeze(-1)
+        return (share * (high - low) / 2).to(action.dtype)
+
+    def share(self, variance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """σ in halves of the actuator's range, where the variance has no units either."""
+        return (self.noise_scale * variance).clamp(self.floor**2, self.ceiling**2).sqrt()
 
 
 def action_box(critic: GPActionValue) -> tuple[Float[Tensor, " A"], Float[Tensor, " A"]]:

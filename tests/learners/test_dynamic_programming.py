@@ -63,7 +63,7 @@ def test_ends_of_the_task_are_learned():
     learner = make(task="cartpole-balance")
     for _ in learner.train():
         pass
-    assert learner.state_dict()["experience"]["terminated"].any()
+    assert learner.experience.all()["terminated"].any()
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import importlib.util
-import os
 import re
 import shutil
 import signal
@@ -14,14 +13,12 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import matplotlib.image
-import numpy as np
 import pytest
-import torch
 import yaml
 
 import envs
 import train
-from torch_gprl.runs import Checkpoints, read_metrics
+from torch_gprl.runs import Checkpoints
 
 ROOT = Path(__file__).parents[1]
 TINY = ["--learners", "2", "--num-envs", "2", "--budget", "20", "--evaluation-episodes", "2"]
@@ -145,83 +142,6 @@ def test_ctrl_c_twice_aborts(tmp_path):
     assert "final return" not in output
 
 
-MISTAKES = {
-    "--task pendlum": r"unknown task 'pendlum'.*pendulum-swingup",
-    "reinforse": r"unknown algorithm 'reinforse'; choose one of policy-gradient",
-    "--lernars 3": r"Unrecognized options: --lernars.*Perhaps you meant: --learners",
-    "--learners three": r"--learners.*'three'",
-    "--learners 0": r"learners must be at least 1, not 0",
-    "--seed -1": r"seed must not be negative, but is -1",
-    "--budget": r"Missing value for argument '--budget'",
-    "--device abacus": r"device 'abacus' cannot be used: .*; --device cpu always can",
-    "--out {folder}": r"run folder .* is not empty; name another",
-    "--out {folder}/file/run": r"cannot write run folder .*; name another folder",
-}
-
-
-@pytest.mark.parametrize("arguments", MISTAKES)
-def test_a_mistake_gets_one_line_and_exit_code_2(arguments, tmp_path, capsys):
-    (tmp_path / "file").touch()
-    code = train.main(arguments.format(folder=tmp_path).split())
-    output, errors = capsys.readouterr()
-    assert code == 2
-    assert output == ""
-    (line,) = errors.splitlines()
-    assert line.startswith("train.py: ")
-    assert re.search(MISTAKES[arguments], line)
-
-
-def test_a_mistake_on_a_coloured_terminal_is_plain(capsys, monkeypatch):
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    train.main(["--learners", "0"])
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.isprintable()
-    assert "learners must be at least 1, not 0" in line
-
-
-def test_a_mistake_ends_the_process_with_code_2():
-    process = start("--learners", "0")
-    output, errors = process.communicate(timeout=120)
-    assert process.returncode == 2
-    assert output == ""
-    assert len(errors.splitlines()) == 1
-
-
-def fields_of(kind: type) -> list[dataclasses.Field]:
-    """The fields that become options, those of dataclasses within included."""
-    found = []
-    for field in dataclasses.fields(kind):
-        found += fields_of(field.type) if dataclasses.is_dataclass(field.type) else [field]
-    return found
-
-
-@pytest.mark.parametrize("name", train.ALGORITHMS)
-def test_help_explains_every_option(name, capsys):
-    with pytest.raises(SystemExit) as end:
-        train.main([name, "--help"])
-    assert end.value.code == 0
-    shown = " ".join(re.sub(r"[│|]", " ", capsys.readouterr().out).split())
-    options = train.ALGORITHMS[name].options()
-    for field in fields_of(type(options.run)) + fields_of(type(options.algorithm)):
-        flag = f"--{field.name.replace('_', '-')}"
-        assert flag in shown
-        explanation = shown.split(flag, 1)[1].split("(default", 1)[0]
-        assert len(explanation.split()) > 2, f"{flag} is not explained"
-
-
-def test_no_argument_means_policy_gradient_on_the_swing_up():
-    name, options = train.parse([])
-    assert name == "policy-gradient"
-    assert options.algorithm == train.PolicyGradientConfig()
-    assert options.run.task == "pendulum-swingup"
-
-
-def test_options_reach_run_and_algorithm():
-    _, options = train.parse(["policy-gradient", "--learners", "3", "--budget", "17", "--out", "there"])
-    assert (options.run.learners, options.algorithm.budget, options.run.out) == (3, 17, Path("there"))
-
-
 # ---------------------------------------------------------------- commands on a finished run
 
 
@@ -302,107 +222,3 @@ def test_a_mistake_about_a_run_gets_one_line_and_exit_code_2(
     (line,) = capsys.readouterr().err.splitlines()
     assert code == 2
     assert re.search(RUN_MISTAKES[arguments], line)
-
-
-# ---------------------------------------------------------------- faults of environments
-
-
-SMALL = {
-    "policy-gradient": "--rollout-steps 20 --total-frames 240 --budget 15",
-    "q-learning": "--rollout-steps 10 --total-frames 120 --sweeps 3 --budget 15",
-    "dynamic-programming": "--rollout-steps 10 --total-frames 120 --model-budget 15 --support 20 --sweeps 3",
-    "actor-critic": "--rollout-steps 10 --total-frames 120 --first-frames 40 --batch 16 --budget 15",
-}
-LEARNERS = [pytest.param(name, marks=[pytest.mark.slow] * (name != "policy-gradient")) for name in SMALL]
-SIZES = "--learners 2 --num-envs 2 --logger csv --checkpoint-interval 1000"
-
-
-def learned(name: str, folder: Path, task: str) -> int:
-    """The exit code of a small run that is neither evaluated nor drawn."""
-    sizes = f"{SIZES} {SMALL[name]}".split()
-    return train.main([name, *sizes, "--task", task, "--out", str(folder)])
-
-
-@pytest.fixture
-def task(monkeypatch):
-    """A pendulum that tests may break; training alone, as evaluation and pictures take longer."""
-    monkeypatch.setattr(train, "conclude", lambda *finished: None)
-    kind = type(envs.ALL["pendulum-swingup"])
-
-    class Fragile(kind):
-        bad_from, constant, ends = 10**9, False, False
-        steps = 0
-
-        def reward(self, before, action, after):
-            Fragile.steps += 1
-            whole = super().reward(before, action, after)
-            if Fragile.steps >= Fragile.bad_from:
-                return whole._replace(total=whole.total * float("nan"))
-            return whole._replace(total=0 * whole.total + 1) if Fragile.constant else whole
-
-        def terminated(self, state):
-            return super().terminated(state) | Fragile.ends
-
-    whole = envs.ALL["pendulum-swingup"]
-    fields = {field.name: getattr(whole, field.name) for field in dataclasses.fields(whole)}
-    monkeypatch.setitem(envs.ALL, "fragile", Fragile(**{**fields, "id": "fragile"}))
-    return Fragile
-
-
-@pytest.mark.parametrize("name", LEARNERS)
-def test_a_broken_environment_ends_the_run_with_its_cause_and_a_checkpoint_to_go_on_from(
-    name, task, tmp_path, capsys
-):
-    assert learned(name, tmp_path / "whole", "fragile") == 0
-    task.steps, task.bad_from = 0, 50
-    assert learned(name, tmp_path / "broken", "fragile") == 1
-    line = capsys.readouterr().err.splitlines()[-1]
-    assert re.search(
-        r"failed after update \d by FloatingPointError: the environment gave a reward that is not finite: .*"
-        r"--resume .*broken goes on from the last checkpoint",
-        line,
-    )
-    assert "Traceback" in (tmp_path / "broken" / "failure.txt").read_text(encoding="utf-8")
-
-    task.bad_from = 10**9
-    assert train.main(["--resume", str(tmp_path / "broken")]) == 0
-    assert not (tmp_path / "broken" / "failure.txt").exists()
-    written = [(tmp_path / run / "metrics.csv").read_bytes() for run in ("whole", "broken")]
-    assert written[0] == written[1]
-
-
-@pytest.mark.parametrize("name", LEARNERS)
-@pytest.mark.parametrize("oddity", ["constant", "ends"])
-def test_constant_rewards_and_episodes_of_one_step_are_no_faults(name, oddity, task, tmp_path):
-    setattr(task, oddity, True)
-    assert learned(name, tmp_path / "run", "fragile") == 0
-    metrics = read_metrics(tmp_path / "run" / "metrics.csv")
-    assert metrics["update"][:, 0].tolist() == [1, 2, 3, 4, 5, 6]
-    if oddity == "ends":
-        assert np.isfinite(metrics["return"]).all()  # an episode ends at every step
-
-
-# ---------------------------------------------------------------- several processes
-
-
-WORKERS = f"--workers 2 {SIZES} --budget 15 --rollout-steps 20"
-
-
-@pytest.mark.slow
-def test_a_killed_worker_ends_the_run_with_its_cause_and_a_checkpoint(tmp_path):
-    folder = tmp_path / "run"
-    command = f"policy-gradient {WORKERS} --total-frames 1000000000".split()
-    process = start(*command, "--out", str(folder))
-    metrics = folder / "metrics.csv"
-    wait_for(lambda: metrics.exists() and metrics.read_text(encoding="utf-8").count("\n") > 2, process)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text(encoding="utf-8").split()
-    names = {child: Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8") for child in children}
-    worker = next(child for child, name in names.items() if "spawn_main" in name)
-    os.kill(int(worker), signal.SIGKILL)
-    _, errors = process.communicate(timeout=120)
-    assert process.returncode == 1
-    assert re.search(
-        r"failed after update \d+ by RuntimeError: a worker failed: worker-0 .*--resume .*",
-        errors.splitlines()[-1],
-    )
-    assert len(list((folder / "checkpoints").iterdir())) == 1

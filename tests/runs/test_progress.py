@@ -1,6 +1,9 @@
 """The display: a panel on a terminal, a line every few seconds elsewhere."""
 
+import contextlib
 import io
+import os
+import sys
 
 import pytest
 import torch
@@ -75,3 +78,15 @@ def test_there_is_no_return_before_an_episode_has_ended():
     none, some = torch.tensor([torch.nan, torch.nan]), torch.tensor([torch.nan, 7.0])
     assert "return –  " in shown(False, [10.0], UPDATE | {"return": none})
     assert "return 7  " in shown(False, [10.0], UPDATE | {"return": some})
+
+
+def test_a_display_that_nobody_looks_at_ends_nothing(monkeypatch):
+    reading, writing = os.pipe()
+    os.close(reading)
+    closed = os.fdopen(writing, "w")
+    monkeypatch.setattr(sys, "stderr", closed)
+    with Progress(100, "pendulum") as progress:
+        progress.update(100, UPDATE)
+        progress.update(100, UPDATE)
+    with contextlib.suppress(BrokenPipeError):
+        closed.close()

@@ -5,6 +5,7 @@ of environments and of random numbers are not among them.
 """
 
 import io
+from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Any
 
@@ -21,7 +22,7 @@ from torch_gprl.policies.streams import NoiseStream
 class ResumableCollector(Collector):
     """A worker's collector, whose state holds all that its next step depends on."""
 
-    def state_dict(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def state_dict(self) -> OrderedDict[str, Any]:
         """The state as bytes, as TorchRL would make a tensordict of it, which has no lists."""
         policy, streams = self._acting()
         own = {"policy": policy.state_dict(), "streams": [stream.state() for stream in streams]}
@@ -47,11 +48,11 @@ def streams_of(module: nn.Module) -> list[tuple[str, NoiseStream]]:
     return [(name, value) for name, value in vars(module).items() if isinstance(value, NoiseStream)]
 
 
-def packed(state: dict[str, Any]) -> dict[str, UInt8[Tensor, " bytes"]]:
+def packed(state: dict[str, Any]) -> OrderedDict[str, UInt8[Tensor, " bytes"]]:
     """A state of tensors and plain numbers as one tensor."""
     file = io.BytesIO()
     torch.save(state, file)
-    return {"packed": torch.from_numpy(np.frombuffer(file.getvalue(), dtype=np.uint8).copy())}
+    return OrderedDict(packed=torch.from_numpy(np.frombuffer(file.getvalue(), dtype=np.uint8).copy()))
 
 
 def unpacked(state: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,13 +1,15 @@
 """The numbers of the actor-critic, each with its unit: they become the command line."""
 
-import math
 from dataclasses import dataclass, field
 
+from torch_gprl.learners.ranges import check_ranges
 from torch_gprl.policies import ConfidenceScale
 
-LEAST_ONE = ("total_frames", "rollout_steps", "budget", "sweeps", "fit_steps", "batch", "hidden")
+LEAST = dict.fromkeys(
+    ("total_frames", "rollout_steps", "budget", "sweeps", "fit_steps", "batch", "hidden"), 1
+)
 POSITIVE = ("amplitude", "noise", "lengthscale", "action_lengthscale", "trust_region", "learning_rate")
-SHARES = ("discount", "growth")
+BELOW_ONE = ("discount", "growth")
 
 
 @dataclass(frozen=True)
@@ -42,12 +44,4 @@ class ActorCriticConfig:
         Raises:
             ValueError: naming the field, its value and what would be valid.
         """
-        for name in LEAST_ONE:
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in POSITIVE:
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in SHARES:
-            if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 0 and below 1, got {getattr(self, name)}")
+        check_ranges(self, least=dict.fromkeys(COUNTS, 1), positive=POSITIVE, discounts=BELOW_ONE)

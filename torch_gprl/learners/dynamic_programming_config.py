@@ -1,9 +1,9 @@
 """The numbers of dynamic programming on a learned model, each with its unit: they become the command line."""
 
-import math
 from dataclasses import dataclass
 
 from torch_gprl.critics.planned_value import Planning
+from torch_gprl.learners.ranges import check_ranges
 from torch_gprl.policies import PlannedBehaviour
 
 LEAST = {
@@ -16,9 +16,10 @@ LEAST = {
     "sweeps": 1,
     "backup_actions": 3,
     "acting_actions": 3,
+    "optimism": 0,
+    "growth": 0,
 }
 POSITIVE = ("lengthscale", "novelty_lengthscale", "tremble")
-NOT_NEGATIVE = ("optimism", "growth")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,17 +51,7 @@ class DynamicProgrammingConfig(PlannedBehaviour):
             ValueError: naming the field, its value and what would be valid.
         """
         super().__post_init__()
-        for name, least in LEAST.items():
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
-        for name in POSITIVE:
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in NOT_NEGATIVE:
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be at least 0 and finite, got {getattr(self, name)}")
-        if not 0 <= self.discount < 1:
-            raise ValueError(f"discount must be at least 0 and below 1, got {self.discount}")
+        check_ranges(self, least=LEAST, positive=POSITIVE, discounts=("discount",))
 
     @property
     def planning(self) -> Planning:

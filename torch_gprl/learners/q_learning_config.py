@@ -2,8 +2,9 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
+from torch_gprl.learners.ranges import check_choices, check_ranges
 from torch_gprl.policies import Behaviour
 
 Targets = Literal["fitted", "online"]
@@ -48,23 +49,7 @@ class QLearningConfig(Behaviour):
             ValueError: naming the field, its value and what would be valid.
         """
         super().__post_init__()
-        for name, least in LEAST.items():
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
-        for name in POSITIVE:
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in SHARES:
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must lie between 0 and 1, got {getattr(self, name)}")
-        if not 0 <= self.discount < 1:
-            raise ValueError(f"discount must be at least 0 and below 1, got {self.discount}")
+        check_ranges(self, least=LEAST, positive=POSITIVE, shares=SHARES, discounts=("discount",))
         if not math.isfinite(self.optimism):
             raise ValueError(f"optimism must be finite, got {self.optimism}")
-        self._check_choices()
-
-    def _check_choices(self) -> None:
-        for name, kind in CHOICES.items():
-            if getattr(self, name) not in get_args(kind):
-                choices = ", ".join(get_args(kind))
-                raise ValueError(f"{name} must be one of {choices}, got {getattr(self, name)!r}")
+        check_choices(self, CHOICES)

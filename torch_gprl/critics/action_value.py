@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torch_gprl.critics.gaussian_actions import action_moments, clipped_moments
 from torch_gprl.gp import Posterior, SparseOnlineGP
+from torch_gprl.gp.prescribed import adopt_basis, observe_anew
 from torch_gprl.kernels import GaussianInputs
 
 
@@ -208,33 +209,53 @@ class GPActionValue(TensorDictModuleBase):
         Raises:
             ValueError: NaN or infinite data, or shapes that do not fit; nothing was learned then.
         """
+        inputs, averaged, rate, target = self._differences(tensordict, policy, discount)
+        self.gp.update(inputs, target, stamp=stamp, next_inputs=averaged, discount=rate)
+
+    @torch.no_grad()
+    def cover(self, observation: Tensor, action: Tensor, lengthscale: Float[Tensor, " D"]) -> None:
+        """Forget what was learned, and spread the basis evenly over this experience.
+
+        Args:
+            observation: [*batch, ..., S].
+            action: [*batch, ..., A].
+            lengthscale: units in which distances count, by column of (observation, action), in those of the
+                scaled inputs.
+        """
+        adopt_basis(self.gp, self.inputs(observation, action), lengthscale)
+
+    @torch.no_grad()
+    def resolve(
+        self, tensordict: TensorDictBase, policy: ProbabilisticTensorDictSequential, discount: float
+    ) -> None:
+        """Solve the temporal differences of all given transitions at once, under today's policy.
+
+        The basis stays, and should cover the transitions (see `cover`): what it misses of them counts as
+        explained. What was learned on it is forgotten: nothing of an older policy's values is left.
+
+        Args:
+            tensordict: transitions [*batch, ...], such as a replay buffer's; see `update_differences`.
+            policy: Gaussian policy whose value is learned.
+            discount: γ per step.
+        """
+        inputs, averaged, rate, target = self._differences(tensordict, policy, discount)
+        gp = self.gp
+        gp.refresh()
+        rows = int(gp.size.max())
+        basis, mask = gp.basis[..., :rows, :], gp.mask[..., None, :rows]
+        # Q(s, a) − γ E_a' Q(s', a') in the weights of the basis
+        rate = rate.unsqueeze(-1)
+        ahead = torch.where(rate > 0, rate * gp.kernel.expected(averaged, basis), 0.0)
+        observe_anew(gp, (gp.kernel(inputs, basis) - ahead) * mask, target)
+
+    def _differences(
+        self, tensordict: TensorDictBase, policy: ProbabilisticTensorDictSequential, discount: float
+    ) -> tuple[Tensor, GaussianInputs, Tensor, Tensor]:
+        """Inputs x, next inputs x' with the policy's actions, γ (0 before a terminal state), and targets."""
         observation, action = (tensordict.get(key) for key in self.in_keys)
         following = tensordict.get("next")
         loc, scale = action_moments(policy, following)
         rate = discount * ~following.get("terminated").reshape(*self.gp.batch_shape, -1)
         target = self.standard_targets(following.get("reward"), rate)
         averaged = self.averaged_inputs(following.get(self.in_keys[0]), loc, scale)
-        inputs = self.inputs(observation, action)
-        self.gp.update(inputs, target, stamp=stamp, next_inputs=averaged, discount=rate)
-
-    @torch.no_grad()
-    def resolve(
-        self,
-        tensordict: TensorDictBase,
-        policy: ProbabilisticTensorDictSequential,
-        discount: float,
-        stamp: int | None = None,
-    ) -> None:
-        """Solve the temporal differences of all given transitions anew, under today's policy.
-
-        The basis stays, what was learned on it is forgotten, and the transitions are absorbed as by
-        `update_differences`: nothing of an older policy's values is left.
-
-        Args:
-            tensordict: transitions [*batch, ...], such as a replay buffer's.
-            policy: Gaussian policy whose value is learned.
-            discount: γ per step.
-            stamp: index of the policy update.
-        """
-        self.gp.forget()
-        self.update_differences(tensordict, policy, discount, stamp)
+        return self.inputs(observation, action), averaged, rate, target

@@ -21,15 +21,22 @@ LEAST_DISTANCE = 0.02  # length scales: nearer points say the same, and ruin the
 
 
 @torch.no_grad()
-def adopt_basis(gp: SparseOnlineGP, inputs: Float[Tensor, "*batch N D"]) -> None:
+def adopt_basis(
+    gp: SparseOnlineGP,
+    inputs: Float[Tensor, "*batch N D"],
+    lengthscale: Float[Tensor, "*#batch D"] | None = None,
+) -> None:
     """Forget everything, and make the basis of points that lie farthest from each other.
 
     Args:
-        gp: process of a stationary kernel; its whole budget is used if the points fill it.
+        gp: process whose whole budget is used if the points fill it.
         inputs: points to choose from, [*batch, N, D].
+        lengthscale: units of distance, one for each column; those of a stationary kernel unless told.
     """
-    assert isinstance(gp.kernel, Stationary)
-    scaled = inputs / gp.kernel.lengthscale.unsqueeze(-2)
+    if lengthscale is None:
+        assert isinstance(gp.kernel, Stationary)
+        lengthscale = gp.kernel.lengthscale
+    scaled = inputs / lengthscale.unsqueeze(-2)
     index, distance = farthest_points(scaled, gp.budget)
     size = (distance > LEAST_DISTANCE).sum(-1)
     rows = index.shape[-1]

@@ -1,10 +1,10 @@
 """The numbers of policy-gradient learning, each with its unit: they become the command line."""
 
-import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 from torch_gprl.critics import USE_ALL_ACTIONS, EstimatorName, KernelName
+from torch_gprl.learners.ranges import check_choices, check_ranges
 from torch_gprl.policies.gibbs_energy import EnergyForm
 
 ControllerForm = Literal["linear", "rbf", "mlp"]
@@ -52,6 +52,7 @@ POSITIVE = (
     "inverse_temperature",
     "final_inverse_temperature",
     "trust_region",
+    "damping",
     "learning_rate",
     "noise",
     "lengthscale",
@@ -84,6 +85,7 @@ class PolicyGradientConfig:
     final_inverse_temperature: float = 30.0  # gibbs: β at last, by equal factors; its σ_e is std
     optimiser: Optimiser = "natural"  # natural gradient, the same by regression on episodes, Adam, or plain
     trust_region: float = 0.05  # KL divergence of the first natural step, nats; falls linearly to 0
+    damping: float = 1e-3  # of the natural gradient: shares of the mean Fisher information along the gradient
     learning_rate: float = 0.01  # of Adam and of the plain gradient; falls linearly to 0
 
     targets: Targets = "returns"  # the critic learns values from returns, or rewards as temporal differences
@@ -93,7 +95,7 @@ class PolicyGradientConfig:
     budget: int = 150  # basis vectors of the critic
     novelty_threshold: float = 0.3  # novelty that makes a point a basis vector, in noise variances
     renew_every: int = 20  # policy updates between renewals of the critic, which forget older data; 1: each
-    replay: int = 0  # environment steps per learner, solved anew at each update; differences only, 0 is off
+    replay: int = 0  # newest environment steps per learner, solved at once at each update; 0: none are kept
     improvements: int = 0  # further steps at each update, by the critic at replayed states; with "all-action"
     noise: float = 0.02  # noise variance of temporal differences, in variances of the reward
     lengthscale: float = 0.3  # of observations, in their standard deviations times √columns; differences
@@ -108,24 +110,15 @@ class PolicyGradientConfig:
         Raises:
             ValueError: naming the field, its value and what would be valid.
         """
-        for name, least in LEAST.items():
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
-        for name in POSITIVE:
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in SHARES:
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must lie between 0 and 1, got {getattr(self, name)}")
-        for name, kind in CHOICES.items():
-            if getattr(self, name) not in get_args(kind):
-                choices = ", ".join(get_args(kind))
-                raise ValueError(f"{name} must be one of {choices}, got {getattr(self, name)!r}")
+        check_ranges(self, least=LEAST, positive=POSITIVE, shares=SHARES)
+        check_choices(self, CHOICES)
         self._check_combinations()
 
     def _check_combinations(self) -> None:
         if self.replay and self.targets != "differences":
             raise ValueError("replay solves temporal differences anew and needs targets 'differences'")
+        if self.replay and not 0 < self.discount < 1:
+            raise ValueError(f"replay needs a discount between 0 and 1, got {self.discount}")
         if self.improvements and (not self.replay or self.estimator != "all-action" or self.discount_states):
             raise ValueError(
                 "improvements need a replay, estimator 'all-action' and discount_states off, got replay "

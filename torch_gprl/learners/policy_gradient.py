@@ -187,7 +187,7 @@ class PolicyGradient:
     def _improve(self) -> None:
         """One more step without new experience: the critic solved anew, all actions at remembered states."""
         assert isinstance(self.teacher, Teacher)
-        remembered, parameters = self.teacher.solve_anew(self.updates), self._trained()
+        remembered, parameters = self.teacher.solve_anew(), self._trained()
         self.optimiser.zero_grad()
         self.losses[-1](remembered)["loss_all_action"].backward()
         self._move(remembered, parameters)
@@ -196,7 +196,8 @@ class PolicyGradient:
         """Step along the gradient that is set, at states of the rollout."""
         left = 1 - self.updates / self.total_updates
         if self.config.optimiser == "natural":
-            natural_step(parameters, self._divergence(rollout), self.config.trust_region * left)
+            region, damping = self.config.trust_region * left, self.config.damping
+            natural_step(parameters, self._divergence(rollout), region, damping=damping)
         elif self.config.optimiser == "episodic-natural":
             direction = self._regress_on_episodes(rollout, parameters)
             step_along(direction, parameters, self._divergence(rollout), self.config.trust_region * left)

@@ -6,9 +6,10 @@ buffer anew under today's policy.
 """
 
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
@@ -21,6 +22,7 @@ from torch_gprl.critics import (
     graphs,
     store_transitions,
 )
+from torch_gprl.critics.difference_equations import Transitions
 from torch_gprl.gp import AgeAwareScore, InformationScore, SparseOnlineGP, fit_hyperparameters
 from torch_gprl.learners.config import PolicyGradientConfig
 from torch_gprl.learners.experience import Experience
@@ -31,6 +33,8 @@ LEAST_FIT_POINTS = 8  # that a fit can be asked for
 TUNING_NODES = 60  # of a graph of basis vectors while its kernel is fitted
 FIRST_FIT, LATER_FITS = 50, 20  # steps of the optimiser: later fits start from the last
 GRAPH_FITS_SHORTER = 4  # times: a graph is searched anew at every step
+RENEWED_SHARE = 0.2  # of all experience that is new when scaling and basis are chosen anew
+IMPROVED_STATES = 256  # of all experience, for a step of the policy without a new rollout
 FIRST_NOISE = 0.05  # noise variance of standardised targets before the first fit
 REMEMBERED = (
     "observation",
@@ -39,14 +43,14 @@ REMEMBERED = (
     ("next", "reward"),
     ("next", "terminated"),
 )
+T = TypeVar("T", Tensor, TensorDictBase)
 
 
 def make_critic(policy: GaussianPolicy, config: PolicyGradientConfig, learners: int) -> GPActionValue:
     """An empty critic of a policy, one Gaussian process for each learner."""
     head = policy.head
     states, actions = head.controller.observation_dim, head.controller.action_dim
-    lengthscale = torch.full((states + actions,), config.action_lengthscale, dtype=torch.float64)
-    lengthscale[:states] = config.lengthscale * math.sqrt(states)
+    lengthscale = _lengthscale(states, actions, config)
     if config.targets == "returns":  # fitted from the first rollout on
         lengthscale.fill_(1)
     # a basis overshoots its budget by a quarter at most
@@ -74,12 +78,19 @@ class Teacher:
         self.critic, self.config = critic, config
         self.policy: ProbabilisticTensorDictSequential = policy
         self.experience = Experience(config.replay) if config.replay else None
+        self.fresh = 0  # transitions of each learner since the basis was chosen
 
     def teach(self, rollout: TensorDictBase, update: int) -> None:
-        """Absorb a rollout that carries `value_target`, [learners, envs, T], made at policy update `update`.
+        """Absorb a rollout [learners, envs, T] with `value_target`, made at policy update `update`."""
+        if self.experience is None:
+            self._learn_on(rollout, update)
+        else:
+            self._remember(rollout)
+            follow_basis(self.critic)
+            self.solve_anew()
 
-        Renews the critic first, at updates 0, 1, 2, 4, ... and every `renew_every`.
-        """
+    def _learn_on(self, rollout: TensorDictBase, update: int) -> None:
+        """Add a rollout to what is known; first renew at updates 0, 1, 2, 4, ... and every `renew_every`."""
         config = self.config
         young = update & (update - 1) == 0  # a power of two: values change fast at first
         if update % config.renew_every == 0 or (young and update < config.renew_every):
@@ -87,19 +98,43 @@ class Teacher:
         store_transitions(self.critic, rollout)
         if config.targets == "returns":
             self.critic.update(rollout, stamp=update)
-        elif self.experience is None:
-            self.critic.update_differences(rollout, self.policy, config.discount, stamp=update)
         else:
-            self.experience.extend(rollout.select(*REMEMBERED).reshape(rollout.shape[0], -1))
-            self.solve_anew(update)
+            self.critic.update_differences(rollout, self.policy, config.discount, stamp=update)
         follow_basis(self.critic)
 
-    def solve_anew(self, update: int) -> TensorDictBase:
-        """Solve the differences of the replay under today's policy; returns it [learners, 1, steps]."""
+    def _remember(self, rollout: TensorDictBase) -> None:
+        """Add a rollout to the experience; where much of it is new, scale and cover it anew."""
+        assert self.experience is not None
+        transitions = rollout.select(*REMEMBERED).reshape(rollout.shape[0], -1)
+        self.experience.extend(transitions)
+        self.fresh += transitions.shape[1]
+        if self.fresh < RENEWED_SHARE * len(self.experience):
+            store_transitions(self.critic, rollout)
+            return
+        self.fresh, critic, remembered = 0, self.critic, self.experience.all()
+        observation, action = remembered.get("observation"), remembered.get("action")
+        critic.standardise(observation, action, remembered.get(("next", "reward")))
+        self._scale_values(remembered)
+        clear_graphs(critic)
+        store_transitions(critic, remembered)
+        dims = observation.shape[-1], action.shape[-1]
+        critic.cover(observation, action, _lengthscale(*dims, self.config).to(critic.input_loc))
+
+    @torch.no_grad()
+    def _scale_values(self, remembered: TensorDictBase) -> None:
+        """The prior of values by the moments of the reward: where nothing is known they stay at its mean."""
+        critic, rest = self.critic, 1 - self.config.discount
+        mean, variance = Transitions.of(remembered, critic.input_loc).reward_moments()
+        critic.target_loc.copy_(mean / rest)
+        critic.target_scale.copy_(torch.where(variance > 0, variance.sqrt(), 1.0) / rest)
+        critic.gp.log_noise_variance.fill_(math.log(self.config.noise * rest**2))
+
+    def solve_anew(self) -> TensorDictBase:
+        """Solve the differences of all experience under today's policy; some of it [learners, 1, steps]."""
         assert self.experience is not None
         remembered = self.experience.all()
-        self.critic.resolve(remembered, self.policy, self.config.discount, stamp=update)
-        return remembered.unsqueeze(1)
+        self.critic.resolve(remembered, self.policy, self.config.discount)
+        return _spread_over(remembered, IMPROVED_STATES).unsqueeze(1)
 
     def _renew(self, rollout: TensorDictBase, update: int) -> None:
         """Forget, and set scaling and hyper-parameters by this rollout."""
@@ -147,6 +182,7 @@ class Teacher:
         return {
             "critic": self.critic.state_dict(),
             "experience": None if self.experience is None else self.experience.state_dict(),
+            "fresh": self.fresh,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -154,8 +190,17 @@ class Teacher:
         self.critic.load_state_dict(state["critic"])
         if self.experience is not None:
             self.experience.load_state_dict(state["experience"])
+        self.fresh = state["fresh"]
 
 
-def _spread_over(data: Tensor, count: int) -> Tensor:
+def _lengthscale(states: int, actions: int, config: PolicyGradientConfig) -> Float[Tensor, " D"]:
+    """Of the columns of observations, then of those of actions."""
+    lengthscale = torch.full((states + actions,), config.action_lengthscale, dtype=torch.float64)
+    lengthscale[:states] = config.lengthscale * math.sqrt(states)
+    return lengthscale
+
+
+def _spread_over(data: T, count: int) -> T:
     """So many rows of data [learners, N, ...], evenly spread over all."""
-    return data[:, torch.linspace(0, data.shape[1] - 1, min(count, data.shape[1])).long()]
+    rows = torch.linspace(0, data.shape[1] - 1, min(count, data.shape[1])).long()
+    return data[:, rows]  # pyright: ignore[reportReturnType]

@@ -5,9 +5,7 @@ from dataclasses import dataclass, field
 from torch_gprl.learners.ranges import check_ranges
 from torch_gprl.policies import ConfidenceScale
 
-LEAST = dict.fromkeys(
-    ("total_frames", "rollout_steps", "budget", "sweeps", "fit_steps", "batch", "hidden"), 1
-)
+COUNTS = ("total_frames", "rollout_steps", "budget", "sweeps", "fit_steps", "batch", "hidden")
 POSITIVE = ("amplitude", "noise", "lengthscale", "action_lengthscale", "trust_region", "learning_rate")
 BELOW_ONE = ("discount", "growth")
 

@@ -1,6 +1,6 @@
 """Claims 3 and 4: does exploration that asks the critic find rewards sooner than tuned noise?
 
-    python -m benchmarks.exploration [--quick] [--tasks pendulum-explore] [--arms thompson] [--learners 20]
+    python -m benchmarks.exploration [--learner q-learning] [--tasks atwood] [--arms confidence] [--quick]
 
 Every arm has the same learner, environments and starts, learner by learner, so that arms are compared in
 pairs. The tuned noise is the best of four standard deviations on the very same seeds, which favours it. Each
@@ -13,7 +13,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from rich.progress import Progress
 from rich.table import Table
 from scipy.stats import wilcoxon
 
-from benchmarks.exploration_arms import ARMS, GAUSSIAN, MATCHED, SETTINGS, Outcome, Setting, run
+from benchmarks.exploration_arms import ARMS, BY_VALUES, GAUSSIAN, MATCHED, SETTINGS, Outcome, Setting, run
 from benchmarks.exploration_pictures import Snapshots, draw
 
 SHOWN = ("steps to threshold", "steps to discovery", "final return", "time in goal", "entropy of cells")
@@ -35,8 +35,9 @@ QUICK_LEARNERS, QUICK_SHARE = 4, 5  # learners, and the part of the steps that a
 class Options:
     """What to compare."""
 
-    tasks: tuple[str, ...] = tuple(SETTINGS)
-    arms: tuple[str, ...] = (*ARMS, MATCHED)
+    learner: Literal["q-learning", "dynamic-programming"] = "dynamic-programming"  # what all arms share
+    tasks: tuple[str, ...] = tuple(BY_VALUES)
+    arms: tuple[str, ...] = ()  # all of the learner's unless named
     learners: int = 20  # paired seeds
     quick: bool = False  # a fifth of the steps, four learners: shows that it works, not who wins
     out: Path = field(default_factory=lambda: Path("runs/exploration"))  # where results go
@@ -45,35 +46,36 @@ class Options:
 def main(options: Options) -> None:
     """Run what is missing, print the table, leave JSON and pictures."""
     torch.set_num_threads(1)
-    unknown = {*options.tasks} - {*SETTINGS} | {*options.arms} - {*ARMS, MATCHED}
+    settings, arms = SETTINGS[options.learner], (*ARMS[options.learner], MATCHED)
+    unknown = {*options.tasks} - {*settings} | {*options.arms} - {*arms}
     if unknown:
-        known = ", ".join((*SETTINGS, *ARMS, MATCHED))
+        known = ", ".join((*settings, *arms))
         raise SystemExit(f"unknown task or arm: {', '.join(unknown)}; choose from {known}")
     if options.quick:
         options = dataclasses.replace(options, learners=QUICK_LEARNERS, out=options.out / "quick")
     options.out.mkdir(parents=True, exist_ok=True)
     for task in options.tasks:
-        setting = SETTINGS[task]
+        setting = settings[task]
         with Progress() as progress:
-            for arm in options.arms:
+            for arm in options.arms or arms:
                 complete(setting, arm, options, progress)
         report(setting, options.out)
 
 
 def record_of(setting: Setting, arm: str, first: int, out: Path) -> Path:
     """Where a finished group of learners is kept, by its first one."""
-    return out / f"{setting.task} {arm} {first}.pt"
+    return out / f"{setting.learner} {setting.task} {arm} {first}.pt"
 
 
 def complete(setting: Setting, arm: str, options: Options, progress: Progress) -> None:
     """Run the groups of an arm that are missing; the matched one waits for what it is matched with."""
     frames = setting.frames // (QUICK_SHARE if options.quick else 1)
-    numbers = ARMS.get(arm)
+    numbers = ARMS[setting.learner].get(arm)
     if numbers is None:
         σ = realised_sigma(setting, "confidence", options.out)
         if σ is None:
             return
-        numbers = {"std": matching_std(setting, σ, options.out)}
+        numbers = {"exploration": "gaussian", "std": matching_std(setting, σ, options.out)}
     for first in range(0, options.learners, GROUP):
         path = record_of(setting, arm, first, options.out)
         if path.exists():
@@ -109,7 +111,10 @@ def matching_std(setting: Setting, sigma: float, out: Path) -> float:
 
 def load(setting: Setting, arm: str, out: Path) -> tuple[Outcome, dict[str, Any]] | None:
     """What the finished groups of an arm did, and the pictures of the first; none if there is no group."""
-    paths = sorted(out.glob(f"{setting.task} {arm} [0-9]*.pt"), key=lambda path: int(path.stem.split()[-1]))
+    paths = sorted(
+        out.glob(f"{setting.learner} {setting.task} {arm} [0-9]*.pt"),
+        key=lambda path: int(path.stem.split()[-1]),
+    )
     groups = [torch.load(path, weights_only=True) for path in paths]
     if not groups:
         return None
@@ -119,7 +124,7 @@ def load(setting: Setting, arm: str, out: Path) -> tuple[Outcome, dict[str, Any]
 
 def report(setting: Setting, out: Path) -> None:
     """Table, JSON and pictures of all arms of a task that are done."""
-    tried = {arm: load(setting, arm, out) for arm in (*ARMS, MATCHED)}
+    tried = {arm: load(setting, arm, out) for arm in (*ARMS[setting.learner], MATCHED)}
     loaded = {arm: kept for arm, kept in tried.items() if kept is not None}
     measures = {arm: outcome.measures(setting) for arm, (outcome, _) in loaded.items()}
     noises = [arm for arm in GAUSSIAN if arm in measures]
@@ -129,7 +134,7 @@ def report(setting: Setting, out: Path) -> None:
     _show(setting, found, tuned)
     path = out / "exploration.json"
     everything = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    everything[setting.task] = {"tuned": tuned, "arms": found}
+    everything.setdefault(setting.learner, {})[setting.task] = {"tuned": tuned, "arms": found}
     path.write_text(json.dumps(everything, indent=2) + "\n", encoding="utf-8")
     draw(
         setting,
@@ -152,7 +157,7 @@ def summarise(
             "mean": values.mean().item(),
             "median": values.median().item(),
             "p": _paired(values, baseline[name]) if baseline else 1.0,
-            "values": values.tolist(),
+            "values": [float(f"{value:.4g}") for value in values.tolist()],
         }
         for name, values in measured.items()
     }
@@ -166,7 +171,7 @@ def _paired(values: torch.Tensor, baseline: torch.Tensor) -> float:
 
 
 def _show(setting: Setting, found: dict[str, dict[str, Any]], tuned: str | None) -> None:
-    table = Table(title=f"{setting.task}: means (p against {tuned}, paired)")
+    table = Table(title=f"{setting.learner} on {setting.task}: means (p against {tuned}, paired)")
     table.add_column("arm")
     for name in SHOWN:
         table.add_column(name)

@@ -1,9 +1,10 @@
 """What `exploration` compares: tasks, ways to explore, and one run with everything that is measured in it.
 
-All arms share the learner, Q-learning with fitted values, its numbers, the environments' random numbers and
-the first uniform actions; only what is done between the solutions differs.
+All arms of a learner share its numbers, the environments' random numbers and the first, random actions; only
+how it acts after that differs.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,15 +14,17 @@ import torch
 from jaxtyping import Float
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import envs
-from torch_gprl.learners import QLearning, QLearningConfig
+from torch_gprl.learners import DynamicProgramming, DynamicProgrammingConfig, QLearning, QLearningConfig
+from torch_gprl.learners.q_learning import action_box_of
 from torch_gprl.runs import evaluate
 
 EVALUATION_SEED = 1_000_000  # the starts of all evaluations
 STARTS = 2  # episodes of an evaluation, for each learner
 CELLS = 20  # of the state plane, in each direction
-LEARNER = {"growth": 0.15, "sweeps": 20, "budget": 150}  # numbers of Q-learning: its defaults, cheaper
+Learner = QLearning | DynamicProgramming
 Points = Callable[[Tensor], Float[Tensor, "... 2"]]
 
 
@@ -31,10 +34,11 @@ class Setting:
 
     Args:
         task: id.
+        learner: q-learning or dynamic-programming.
+        numbers: of the learner, where they are not its defaults.
         threshold: mean return of the greedy policy.
         frames: environment steps of each learner.
         every: environment steps between evaluations.
-        discount: γ.
         goal: reward of a step that counts as being in the goal region.
         place: observations to two coordinates.
         low, high: the plane's range.
@@ -42,10 +46,11 @@ class Setting:
     """
 
     task: str
+    learner: str
+    numbers: dict[str, Any]
     threshold: float
     frames: int
     every: int
-    discount: float
     goal: float
     place: Points
     low: tuple[float, float]
@@ -68,13 +73,15 @@ def _swing_angle_and_length(observation: Tensor) -> Tensor:
     return torch.stack([torch.atan2(sine, cosine), r], -1)
 
 
-SETTINGS = {
+CHEAPER = {"growth": 0.15, "sweeps": 20, "budget": 150}  # Q-learning's defaults, with less of everything
+BY_VALUES = {
     "pendulum-explore": Setting(
         "pendulum-explore",
+        "q-learning",
+        CHEAPER | {"discount": 0.97},
         threshold=50.0,
         frames=1_500,
         every=100,
-        discount=0.97,
         goal=0.5,
         place=_angle_and_speed,
         low=(-math.pi, -10.0),
@@ -83,10 +90,11 @@ SETTINGS = {
     ),
     "MountainCarContinuous-v0": Setting(
         "MountainCarContinuous-v0",
+        "q-learning",
+        CHEAPER | {"discount": 0.99},
         threshold=90.0,
         frames=3_000,
         every=500,
-        discount=0.99,
         goal=50.0,
         place=lambda observation: observation,
         low=(-1.2, -0.07),
@@ -95,10 +103,11 @@ SETTINGS = {
     ),
     "atwood": Setting(
         "atwood",
-        threshold=100.0,
+        "q-learning",
+        CHEAPER | {"discount": 0.95},
+        threshold=100.0,  # at most 200 steps of at most 1: for more than half of them near the wanted swing
         frames=1_500,
         every=200,
-        discount=0.95,
         goal=0.8,
         place=_swing_angle_and_length,
         low=(-math.pi, 0.3),
@@ -107,34 +116,64 @@ SETTINGS = {
     ),
 }
 
+
+def _by_plans(task: str, frames: int, every: int) -> Setting:
+    """The same task for dynamic programming, which needs fewer steps but more time for each."""
+    numbers = {"growth": 0.1}  # plans half as often as it does by default
+    return dataclasses.replace(
+        BY_VALUES[task], learner="dynamic-programming", numbers=numbers, frames=frames, every=every
+    )
+
+
+BY_PLANS = {
+    "pendulum-explore": _by_plans("pendulum-explore", 800, 50),
+    "MountainCarContinuous-v0": _by_plans("MountainCarContinuous-v0", 2_500, 500),
+    "atwood": _by_plans("atwood", 1_500, 150),
+}
+SETTINGS = {"q-learning": BY_VALUES, "dynamic-programming": BY_PLANS}
+
 STDS = (0.1, 0.3, 0.6, 1.0)  # of which the best for a task is the tuned one
-GAUSSIAN = {f"gaussian {std}": {"std": std} for std in STDS}
-GUIDED: dict[str, dict[str, Any]] = {
-    "confidence": {"exploration": "confidence"},
-    "confidence x10": {"exploration": "confidence", "noise_scale": 10.0},
+GAUSSIAN = {f"gaussian {std}": {"exploration": "gaussian", "std": std} for std in STDS}
+ANNEALED = {"annealed": {"exploration": "gaussian", "std": 1.0, "final_std": 0.05}}
+MATCHED = "matched"  # gaussian, with the average σ of confidence
+GIBBS = {
     "gibbs printed": {"exploration": "gibbs", "gibbs_form": "printed"},
     "gibbs robust": {"exploration": "gibbs"},
-    "thompson": {"exploration": "thompson"},
-    "upper": {"exploration": "upper"},
 }
-MATCHED = "matched"  # gaussian, with the average σ of confidence
-ARMS: dict[str, dict[str, Any]] = GAUSSIAN | {"annealed": {"std": 1.0, "final_std": 0.05}} | GUIDED
+ARMS: dict[str, dict[str, dict[str, Any]]] = {
+    "q-learning": GAUSSIAN
+    | ANNEALED
+    | {
+        "confidence": {"exploration": "confidence"},
+        "confidence x10": {"exploration": "confidence", "noise_scale": 10.0},
+    }
+    | GIBBS
+    | {"thompson": {"exploration": "thompson"}, "upper": {"exploration": "upper"}},
+    "dynamic-programming": GAUSSIAN
+    | ANNEALED
+    | {"confidence": {"exploration": "confidence"}}
+    | GIBBS
+    | {"optimism": {"exploration": "optimism"}},
+}
 
 
 class Watched:
     """A collection that keeps what the learner sees, and how far it strayed from the greedy action."""
 
-    def __init__(self, learner: QLearning) -> None:
-        self.learner, self.inner = learner, learner.collection
+    def __init__(self, learner: Learner) -> None:
+        self.policy, self.inner = learner.policy, learner.collection
+        low, high = action_box_of(learner.env)
+        self.half = (high - low) / 2
         self.seen: list[TensorDictBase] = []
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
         """The next steps."""
         rollout = self.inner.rollout()
-        box, observation = self.learner.maximiser, rollout.get("observation")
-        half = (box.high - box.low) / 2
-        strayed = (rollout.get("action") - box(observation).action) / half
+        asked = rollout.select("observation").clone()
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            greedy = self.policy(asked).get("action")
+        strayed = (rollout.get("action") - greedy) / self.half
         kept = rollout.select("observation", ("next", "reward")).clone()
         self.seen.append(kept.set("strayed", strayed.square().mean(-1)))
         return rollout
@@ -192,22 +231,30 @@ def first_step(happened: Tensor) -> Tensor:
     return torch.where(happened.any(1), happened.int().argmax(1), happened.shape[1]).double()
 
 
+def start(setting: Setting, numbers: dict[str, Any], learners: range, frames: int) -> Learner:
+    """The learner of a setting, on its task."""
+    env = envs.make(
+        setting.task, seed=0, learners=len(learners), num_envs=1, threads=1, first_learner=learners.start
+    )
+    numbers = {"total_frames": frames} | setting.numbers | numbers
+    if setting.learner == "q-learning":
+        return QLearning(env, QLearningConfig(**numbers), first_learner=learners.start)
+    return DynamicProgramming(env, DynamicProgrammingConfig(**numbers), first_learner=learners.start)
+
+
 def run(
     setting: Setting, numbers: dict[str, Any], learners: range, frames: int
-) -> Iterator[tuple[QLearning, Outcome]]:
+) -> Iterator[tuple[Learner, Outcome]]:
     """Train one arm; yields after each evaluation."""
-    count = len(learners)
-    options = {"learners": count, "num_envs": 1, "threads": 1, "first_learner": learners.start}
-    config = QLearningConfig(total_frames=frames, discount=setting.discount, **LEARNER | numbers)
-    env = envs.make(setting.task, seed=0, **options)
-    learner = QLearning(env, config, seed=0, first_learner=learners.start)
+    options = {"learners": len(learners), "num_envs": STARTS, "threads": 1, "first_learner": learners.start}
+    learner = start(setting, numbers, learners, frames)
     watched = Watched(learner)
     learner.collection = watched  # pyright: ignore[reportAttributeAccessIssue]
     stops, returns = [], []
     for _ in learner.train():
         if learner.frames % setting.every and learner.frames < frames:
             continue
-        test = envs.make(setting.task, seed=EVALUATION_SEED, **options | {"num_envs": STARTS})
+        test = envs.make(setting.task, seed=EVALUATION_SEED, **options)
         stops.append(learner.frames)
         returns.append(evaluate(test, learner.policy).mean(1))
         seen = [part.flatten(1) for part in watched.seen]

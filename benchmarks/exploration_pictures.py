@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from tensordict import TensorDict
 from torch import Tensor
 
-from benchmarks.exploration_arms import CELLS, Outcome, Setting
-from torch_gprl.learners import QLearning
+from benchmarks.exploration_arms import CELLS, Learner, Outcome, Setting
+from torch_gprl.learners import DynamicProgramming, QLearning
 from torch_gprl.policies import ConfidenceNoise, GibbsPolicy
 
 GRID = 41  # points of a map in each direction
@@ -32,19 +32,47 @@ class Snapshots:
         self.taken: dict[str, Any] = {}
 
     @torch.no_grad()
-    def take(self, learner: QLearning) -> None:
+    def take(self, learner: Learner) -> None:
         """Add what can be seen now."""
-        if self.setting.task not in DIMS or not learner.teacher.taught:
+        if self.setting.task not in DIMS:
             return
+        if isinstance(learner, DynamicProgramming):
+            self._take_plan(learner)
+        elif learner.teacher.taught:
+            self._take_critic(learner)
+
+    def _take_critic(self, learner: QLearning) -> None:
         explorer = learner.policy.policy
         if isinstance(explorer, ConfidenceNoise):
             states = self._everyone(learner, self._plane())
             _, std = explorer.head.parameters_at(states)
             width = (learner.maximiser.high - learner.maximiser.low).item() / 2
-            self.taken.setdefault("sigma", []).append(std[0, :, 0].reshape(GRID, GRID).float() / width)
-            self.taken.setdefault("frames", []).append(learner.frames)
-        elif isinstance(explorer, GibbsPolicy) and learner.frames <= self.setting.frames / 2:
+            self._keep_sigma(std / width, learner.frames)
+        elif isinstance(explorer, GibbsPolicy) and self._early(learner):
             self.taken["figure 2"] = self._value_and_density(learner, explorer)
+
+    def _take_plan(self, learner: DynamicProgramming) -> None:
+        behaviour, plan = learner.policy.behaviour, learner.critic
+        if behaviour.exploration == "confidence":
+            states = self._everyone(learner, self._plane()).double()
+            self._keep_sigma(learner.policy.std_at(states, plan.best_action(states, True)), learner.frames)
+        elif behaviour.exploration == "gibbs" and self._early(learner):
+            first, points = self._line()
+            states = self._everyone(learner, points).double()
+            self.taken["figure 2"] = self._panels(
+                first,
+                plan.acting_actions[:, 0] * (learner.env.action_spec.space.high.flatten()[0]),
+                plan.candidate_values(states, explore=True)[0],
+                learner.policy.gibbs_shares(states)[0],
+            )
+
+    def _early(self, learner: Learner) -> bool:
+        return learner.frames <= self.setting.frames / 2
+
+    def _keep_sigma(self, std: Tensor, frames: int) -> None:
+        """σ of the first learner [L, GRID², 1], in halves of the range."""
+        self.taken.setdefault("sigma", []).append(std[0, :, 0].reshape(GRID, GRID).float())
+        self.taken.setdefault("frames", []).append(frames)
 
     def _plane(self) -> Tensor:
         """Points of the plane [GRID², 2], the first coordinate first."""
@@ -57,44 +85,45 @@ class Snapshots:
             return torch.stack([θ.cos(), θ.sin(), ω], -1)
         return points
 
-    def _everyone(self, learner: QLearning, points: Tensor) -> Tensor:
+    def _everyone(self, learner: Learner, points: Tensor) -> Tensor:
         """The same states for every learner."""
         return self._observations(points).expand(learner.learners, -1, -1)
 
-    def _value_and_density(self, learner: QLearning, explorer: GibbsPolicy) -> dict[str, Tensor]:
-        """Q and π over the first coordinate and the action, the second coordinate zero."""
+    def _line(self) -> tuple[Tensor, Tensor]:
+        """Places along the first coordinate, and the points there, the second coordinate zero."""
         first = torch.linspace(self.setting.low[0], self.setting.high[0], GRID)
-        points = torch.stack([first, torch.zeros(GRID)], -1)
+        return first, torch.stack([first, torch.zeros(GRID)], -1)
+
+    def _value_and_density(self, learner: QLearning, explorer: GibbsPolicy) -> dict[str, Tensor]:
+        """Q and π over the first coordinate and the action."""
+        first, points = self._line()
         states = self._everyone(learner, points)
         grid = explorer.head.cover.candidates
-        data = TensorDict({"observation": states}, states.shape[:2])
-        density = explorer.get_dist(data)
+        density = explorer.get_dist(TensorDict({"observation": states}, states.shape[:2]))
         shares = torch.stack(
             [density.log_prob(action.expand(*states.shape[:2], 1)).exp()[0] for action in grid], -1
         )
-        low, high = self.setting.low[0], self.setting.high[0]
-        anywhere = torch.stack([low + (high - low) * torch.rand(SAMPLES), torch.zeros(SAMPLES)], -1)
-        many = self._everyone(learner, anywhere)
-        drawn = explorer.get_dist(TensorDict({"observation": many}, many.shape[:2])).sample()[0, :, 0]
-        angle = self.setting.place(many[0])[:, 0]
         value = explorer.head.opinion(states, explorer.head.mean_at(states), states[..., :0])["preference"][0]
-        return {
-            "first": first,
-            "action": grid[:, 0],
-            "value": value,
-            "density": shares,
-            "samples": torch.stack([angle, drawn.float()], -1),
-        }
+        return self._panels(first, grid[:, 0], value, shares)
+
+    def _panels(self, first: Tensor, action: Tensor, value: Tensor, density: Tensor) -> dict[str, Tensor]:
+        """Value and density [GRID, J] with actions drawn from the density, a few at each place."""
+        drawn = torch.multinomial(density, SAMPLES // GRID, replacement=True)
+        places = first.unsqueeze(-1).expand(drawn.shape)
+        samples = torch.stack([places.float(), action.float()[drawn]], -1).flatten(0, 1)
+        least, most = value.aminmax(dim=-1, keepdim=True)
+        value = (value - least) / (most - least).clamp_min(torch.finfo(value.dtype).tiny)
+        return {"first": first, "action": action, "value": value, "density": density, "samples": samples}
 
 
 def draw(
     setting: Setting, outcomes: dict[str, Outcome], pictures: dict[str, dict[str, Any]], out: Path
 ) -> None:
     """All pictures of a task, as far as arms are done."""
-    draw_curves(setting, outcomes, out / f"{setting.task}-curves.png")
-    draw_visits(setting, outcomes, out / f"{setting.task}-visits.png")
+    draw_curves(setting, outcomes, out / f"{setting.learner}-{setting.task}-curves.png")
+    draw_visits(setting, outcomes, out / f"{setting.learner}-{setting.task}-visits.png")
     for arm, taken in pictures.items():
-        name = f"{setting.task}-{arm.replace(' ', '-')}"
+        name = f"{setting.learner}-{setting.task}-{arm.replace(' ', '-')}"
         if "sigma" in taken:
             draw_sigma(setting, taken, out / f"{name}-sigma.png")
         if "figure 2" in taken:
@@ -111,7 +140,11 @@ def draw_curves(setting: Setting, outcomes: dict[str, Outcome], path: Path) -> N
         steps = np.linspace(0, outcome.frames[-1], outcome.sigma.shape[1])
         sigma.plot(steps, outcome.sigma.square().mean(0).sqrt(), **style)
     returns.axhline(setting.threshold, color="0.7", linewidth=1)
-    returns.set(xlabel="environment steps", ylabel="return of the greedy policy", title=setting.task)
+    returns.set(
+        xlabel="environment steps",
+        ylabel="return of the greedy policy",
+        title=f"{setting.learner} on {setting.task}",
+    )
     sigma.set(xlabel="environment steps", ylabel="distance to the greedy action\n(halves of the range, rms)")
     returns.legend(fontsize="x-small")
     figure.savefig(path, dpi=110)

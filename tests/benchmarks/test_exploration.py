@@ -9,9 +9,18 @@ import torch
 
 from benchmarks import exploration
 from benchmarks.exploration import Options, main, summarise
-from benchmarks.exploration_arms import CELLS, SETTINGS, STARTS, Outcome, first_step, run, steps_to
+from benchmarks.exploration_arms import (
+    BY_PLANS,
+    BY_VALUES,
+    CELLS,
+    STARTS,
+    Outcome,
+    first_step,
+    run,
+    steps_to,
+)
 
-SETTING = SETTINGS["pendulum-explore"]
+SETTING = BY_VALUES["pendulum-explore"]
 
 
 def outcome(states: torch.Tensor, reward: torch.Tensor) -> Outcome:
@@ -53,16 +62,17 @@ def test_pairs_that_agree_prove_nothing_and_pairs_that_all_differ_do():
 
 @pytest.mark.parametrize("task", ["atwood", pytest.param("MountainCarContinuous-v0", marks=pytest.mark.slow)])
 def test_every_task_has_its_plane(task):
-    ((_, found),) = run(SETTINGS[task], {}, range(2), 25)
+    ((_, found),) = run(BY_VALUES[task], {}, range(2), 25)
     assert found.frames == [25]
     assert found.returns.shape == (2, 1)
     assert ((found.states >= 0) & (found.states < 1)).all()
     assert found.states.shape == (2, 25, 2)
 
 
-def test_arms_start_alike():
+@pytest.mark.parametrize(("setting", "other"), [(SETTING, "upper"), (BY_PLANS["pendulum-explore"], "gibbs")])
+def test_arms_start_alike(setting, other):
     first, second = (
-        next(run(SETTING, numbers, range(2), 25))[1] for numbers in ({}, {"exploration": "upper"})
+        next(run(setting, {"exploration": scheme}, range(2), 25))[1] for scheme in ("gaussian", other)
     )
     assert torch.equal(first.states[:, 0], second.states[:, 0])
     assert STARTS > 0
@@ -72,16 +82,16 @@ def test_arms_start_alike():
 def test_finished_arms_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(exploration, "QUICK_SHARE", 60)
     arms = ("gaussian 0.3", "confidence", "matched")
-    options = Options(tasks=("pendulum-explore",), arms=arms, quick=True, out=tmp_path)
+    options = Options("q-learning", ("pendulum-explore",), arms, quick=True, out=tmp_path)
     main(options)
     results = tmp_path / "quick" / "exploration.json"
-    first = json.loads(results.read_text(encoding="utf-8"))["pendulum-explore"]
+    first = json.loads(results.read_text(encoding="utf-8"))["q-learning"]["pendulum-explore"]
     assert first["tuned"] == "gaussian 0.3"
     assert set(first["arms"]) == set(arms)
-    assert (tmp_path / "quick" / "pendulum-explore-visits.png").exists()
+    assert (tmp_path / "quick" / "q-learning-pendulum-explore-visits.png").exists()
     monkeypatch.setattr(exploration, "run", None)  # nothing is left to run
     main(options)
-    assert json.loads(results.read_text(encoding="utf-8"))["pendulum-explore"] == first
+    assert json.loads(results.read_text(encoding="utf-8"))["q-learning"]["pendulum-explore"] == first
 
 
 def test_matched_noise_is_as_large_once_it_is_clipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
+from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.gradient_data import STEPS, Batches
@@ -18,10 +19,10 @@ from torch_gprl.critics import (
     GPValueEstimator,
 )
 from torch_gprl.learners import PolicyGradientConfig
-from torch_gprl.learners.config import Targets
 from torch_gprl.learners.neural_value import NeuralTeacher, NeuralValue
 from torch_gprl.learners.teaching import Teacher, make_critic
 from torch_gprl.objectives import AllActionLoss, PolicyGradientLoss
+from torch_gprl.policies import GaussianPolicy
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,8 @@ class Arm:
 
     Critics are "none", "neural", and Gaussian processes: "returns" and "differences" learned one earlier
     batch, "replay" the differences of several, and "pooled" those of so many that next to nothing is unknown.
-    What the last one leaves is the noise of the few states in a batch, which no critic can help.
+    What the last one leaves is the noise of the few states in a batch, which no critic can help; averages
+    over all actions at all `remembered` states, those of the earlier batches too, have less of it.
     """
 
     label: str
@@ -38,6 +40,7 @@ class Arm:
     estimator: EstimatorName
     horizon: int = 1
     trace: float = 0.95
+    remembered: bool = False
 
 
 ARMS = (
@@ -61,10 +64,13 @@ ARMS = (
     Arm("GPTD all-action", "differences", "all-action"),
     Arm("GPTD GAE, λ = 0.8, replay", "replay", "generalised", trace=0.8),
     Arm("GPTD all-action, replay", "replay", "all-action"),
+    Arm("the same, remembered states", "replay", "all-action", remembered=True),
     Arm("all-action, best critic", "pooled", "all-action"),
 )
 REPLAYED, POOLED = 5, 40  # batches
-POOLED_BUDGET, POOLED_NOISE = 600, 0.01
+GAUSSIAN = ("returns", "differences", "replay", "pooled")  # processes as critics
+AT_ONCE = {"targets": "differences", "lengthscale": 0.5, "noise": 0.001}  # where all differences are solved
+POOLED_BUDGET = 600
 
 
 class Critics(NamedTuple):
@@ -79,9 +85,9 @@ def fit_critics(
 ) -> Critics:
     """All critics: fitted on one earlier batch for each learner, on several, and the one that serves all."""
     gaussian = {
-        "returns": fit_gaussian(earlier, numbers, "returns"),
-        "differences": fit_gaussian(earlier, numbers, "differences"),
-        "replay": fit_gaussian(several, numbers, "differences"),
+        "returns": fit_gaussian(earlier, numbers),
+        "differences": fit_gaussian(earlier, dataclasses.replace(numbers, targets="differences")),
+        "replay": fit_gaussian(several, at_once(several, numbers)),
         "pooled": pooled,
     }
     return Critics(gaussian, fit_neural(earlier, numbers))
@@ -99,17 +105,21 @@ def fit_neural(earlier: Batches, numbers: PolicyGradientConfig) -> NeuralValue:
 
 def fit_pooled(batch: Batches, numbers: PolicyGradientConfig, learners: int) -> GPActionValue:
     """One critic that has learned a very large batch of one learner, repeated for all learners."""
-    config = dataclasses.replace(numbers, targets="differences", budget=POOLED_BUDGET, noise=POOLED_NOISE)
-    one = fit_gaussian(batch, config, "differences")
+    config = at_once(batch, dataclasses.replace(numbers, budget=POOLED_BUDGET))
+    one = fit_gaussian(batch, config)
     critic = make_critic(batch.policy, config, learners)
     own = critic.state_dict()
     critic.load_state_dict({key: value.expand_as(own[key]) for key, value in one.state_dict().items()})
     return critic.requires_grad_(False)
 
 
-def fit_gaussian(earlier: Batches, numbers: PolicyGradientConfig, targets: Targets) -> GPActionValue:
+def at_once(earlier: Batches, numbers: PolicyGradientConfig) -> PolicyGradientConfig:
+    """Numbers of a critic that remembers all these batches."""
+    return dataclasses.replace(numbers, replay=earlier.data[0].numel(), **AT_ONCE)
+
+
+def fit_gaussian(earlier: Batches, config: PolicyGradientConfig) -> GPActionValue:
     """A Gaussian-process critic, taught as the learner teaches it."""
-    config = dataclasses.replace(numbers, targets=targets)
     critic = make_critic(earlier.policy, config, earlier.data.shape[0])
     data = GPValueEstimator(critic, earlier.policy, config.discount, horizon=STEPS)(earlier.data.clone())
     Teacher(critic, earlier.policy, config).teach(data, 0)
@@ -128,20 +138,27 @@ def evaluations(new: Batches, critics: Critics, discount: float) -> dict[str, Ev
     return seen
 
 
-def gradients(arm: Arm, new: Batches, critics: Critics, seen: dict[str, Evaluation]) -> Float[Tensor, "L P"]:
+def gradients(
+    arm: Arm, new: Batches, several: Batches, critics: Critics, seen: dict[str, Evaluation]
+) -> Float[Tensor, "L P"]:
     """The arm's gradient estimate from each batch: ascent direction, mean over steps."""
     weight = ESTIMATORS[arm.estimator](
         dataclasses.replace(seen[arm.critic], horizon=arm.horizon, trace=arm.trace)
     )
     critic = critics.gaussian[arm.critic] if arm.estimator in USE_ALL_ACTIONS else None
-    return ascent(new, weight, critic)
+    if not arm.remembered:
+        return ascent(new.data, new.policy, weight, critic)
+    both = TensorDict.cat([several.data, new.data], 1)
+    assert isinstance(both, TensorDict)
+    return ascent(both, new.policy, weight.new_zeros(both.shape), critic)
 
 
-def ascent(new: Batches, weight: Tensor, critic: GPActionValue | None = None) -> Float[Tensor, "L P"]:
+def ascent(
+    data: TensorDict, policy: GaussianPolicy, weight: Tensor, critic: GPActionValue | None = None
+) -> Float[Tensor, "L P"]:
     """Gradient of each learner's batch for weights of the scores, with the all-action term of `critic`."""
-    policy = new.policy
     policy.zero_grad()
-    data = new.data.clone(False).set("advantage", weight.unsqueeze(-1))
+    data = data.clone(False).set("advantage", weight.unsqueeze(-1))
     PolicyGradientLoss(policy)(data)["loss_objective"].backward()
     if critic is not None:
         AllActionLoss(policy, critic)(data)["loss_all_action"].backward()

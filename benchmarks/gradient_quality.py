@@ -4,26 +4,27 @@
 
 At fixed policies, every estimator sees the same independent batches of 5 episodes of 200 steps; its critic
 was fitted on one earlier batch, or on five ("replay"). The reference is the mean over many more batches of an
-unbiased estimator on true returns.
+unbiased estimator on true returns. A command that was stopped goes on where it stood.
 Leaves gradient_quality.json and gradient_quality.png in --out.
 """
 
 import dataclasses
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 import tyro
-from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks.gradient_arms import (
     ARMS,
+    GAUSSIAN,
     POOLED,
     REPLAYED,
     Quality,
@@ -35,7 +36,7 @@ from benchmarks.gradient_arms import (
     quality,
 )
 from benchmarks.gradient_data import EPISODES, SETTINGS, STEPS, Fixed, batches, fixed_policies
-from benchmarks.gradient_truth import branches
+from benchmarks.gradient_truth import Branches, branches
 from torch_gprl.critics import GPActionValue
 from torch_gprl.learners import PolicyGradientConfig
 
@@ -54,7 +55,7 @@ class Options:
 
     quick: bool = False  # 40 batches on the first task alone: shows that it works, not how good it is
     batches: int = 200  # independent batches of every policy
-    reference_batches: int = 400  # further ones, for the reference gradient
+    reference_batches: int = 800  # further ones, for the reference gradient
     task: str | None = None  # one task instead of all
     budget: int = 300  # basis vectors of the critics
     out: Path = field(default_factory=lambda: Path("runs/gradient-quality"))  # where results and policies go
@@ -93,39 +94,84 @@ class Comparison(NamedTuple):
 
 def compare(fixed: Fixed, options: Options) -> Comparison:
     """Every estimator at one policy."""
-    started, discount = time.monotonic(), fixed.setting.discount
-    numbers = PolicyGradientConfig(budget=options.budget, discount=discount)
-    pooled = fit_pooled(batches(fixed, 1, POOLED_SEED, POOLED * EPISODES), numbers, SIDE_BY_SIDE)
-    reference = reference_gradient(fixed, options, pooled)
-    truth = branches(fixed, BRANCHES_SEED)
-    found: dict[str, list[Tensor]] = {arm.label: [] for arm in ARMS}
-    advantages: dict[str, list[Tensor]] = {}
-    for seed in _seeds(options.batches, 0):
-        earlier = batches(fixed, SIDE_BY_SIDE, seed)
-        several = batches(fixed, SIDE_BY_SIDE, seed + 2, REPLAYED * EPISODES)
-        critics = fit_critics(earlier, several, pooled, numbers)
-        new = batches(fixed, SIDE_BY_SIDE, seed + 1)
-        seen = evaluations(new, critics, discount)
-        for arm in ARMS:
-            found[arm.label].append(gradients(arm, new, critics, seen))
-        for name, critic in critics.gaussian.items():
-            advantages.setdefault(name, []).append(truth.correlation(critic))
+    started = time.monotonic()
+    records = Records(options.out / "records" / f"{fixed.setting.task}-{fixed.name}-{options.budget}")
+    sides = Sides(fixed, options.budget)
+    reference = [
+        records.recall(f"reference-{seed}", partial(sides.reference, seed))["gradient"]
+        for seed in _seeds(options.reference_batches, 1_000_000)
+    ]
+    groups = [
+        records.recall(f"batches-{seed}", partial(sides.estimates, seed))
+        for seed in _seeds(options.batches, 0)
+    ]
     print(f"{options.batches} batches in {time.monotonic() - started:.0f} s", flush=True)
+    aim = torch.cat(reference).mean(0)
     return Comparison(
-        {label: quality(torch.cat(parts), reference) for label, parts in found.items()},
-        {name: float(torch.cat(parts).mean()) for name, parts in advantages.items()},
+        {arm.label: quality(torch.cat([group[arm.label] for group in groups]), aim) for arm in ARMS},
+        {name: float(torch.cat([group[name] for group in groups]).mean()) for name in GAUSSIAN},
     )
 
 
-def reference_gradient(fixed: Fixed, options: Options, pooled: GPActionValue) -> Float[Tensor, " P"]:
-    """Mean over many batches of true returns, less a critic's Q and with its all-action term: unbiased."""
-    parts = []
-    for seed in _seeds(options.reference_batches, 1_000_000):
-        new = batches(fixed, SIDE_BY_SIDE, seed)
+class Records:
+    """Results of groups of batches in files, so that a command that was stopped goes on.
+
+    Args:
+        folder: where they go.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def recall(self, name: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
+        """What was kept under that name, or is made and kept now."""
+        path = self.folder / f"{name}.pt"
+        if not path.exists():
+            partial_path = path.with_suffix(".partial")
+            torch.save(make(), partial_path)
+            partial_path.rename(path)
+        return torch.load(path, weights_only=True)
+
+
+class Sides:
+    """Groups of batches that run side by side at one policy, with what all of them share.
+
+    Args:
+        fixed: the policy.
+        budget: basis vectors of the critics.
+    """
+
+    def __init__(self, fixed: Fixed, budget: int) -> None:
+        self.fixed, self.discount = fixed, fixed.setting.discount
+        self.numbers = PolicyGradientConfig(budget=budget, discount=self.discount)
+
+    @cached_property
+    def pooled(self) -> GPActionValue:
+        """The critic of very many batches."""
+        return fit_pooled(batches(self.fixed, 1, POOLED_SEED, POOLED * EPISODES), self.numbers, SIDE_BY_SIDE)
+
+    @cached_property
+    def truth(self) -> Branches:
+        """True advantages."""
+        return branches(self.fixed, BRANCHES_SEED)
+
+    def estimates(self, seed: int) -> dict[str, Tensor]:
+        """Every arm's gradient for each batch; each critic's correlation with the true advantages."""
+        earlier = batches(self.fixed, SIDE_BY_SIDE, seed)
+        several = batches(self.fixed, SIDE_BY_SIDE, seed + 2, REPLAYED * EPISODES)
+        critics = fit_critics(earlier, several, self.pooled, self.numbers)
+        new = batches(self.fixed, SIDE_BY_SIDE, seed + 1)
+        seen = evaluations(new, critics, self.discount)
+        made = {arm.label: gradients(arm, new, several, critics, seen) for arm in ARMS}
+        return made | {name: self.truth.correlation(critic) for name, critic in critics.gaussian.items()}
+
+    def reference(self, seed: int) -> dict[str, Tensor]:
+        """True returns, less a critic's Q and with its all-action term: unbiased, and with little noise."""
+        new = batches(self.fixed, SIDE_BY_SIDE, seed)
         with torch.no_grad():
-            taken = pooled.mean_value(new.data["observation"], new.data["action"])
-        parts.append(ascent(new, new.true_return - taken, pooled))
-    return torch.cat(parts).mean(0)
+            taken = self.pooled.mean_value(new.data["observation"], new.data["action"])
+        return {"gradient": ascent(new.data, new.policy, new.true_return - taken, self.pooled)}
 
 
 def _seeds(total: int, first: int) -> Iterator[int]:

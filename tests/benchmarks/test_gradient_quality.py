@@ -71,7 +71,7 @@ def test_every_arm_gives_a_gradient_for_every_batch(made):
     critics = fit_critics(earlier, earlier, pooled, NUMBERS)
     seen = evaluations(new, critics, NUMBERS.discount)
     for arm in ARMS:
-        found = gradients(arm, new, critics, seen)
+        found = gradients(arm, new, earlier, critics, seen)
         assert found.shape[0] == LEARNERS
         assert (found.norm(dim=1) > 0).all()
 

@@ -22,7 +22,6 @@ from torch_gprl.learners.q_learning import action_box_of
 from torch_gprl.runs import evaluate
 
 EVALUATION_SEED = 1_000_000  # the starts of all evaluations
-STARTS = 2  # episodes of an evaluation, for each learner
 CELLS = 20  # of the state plane, in each direction
 Learner = QLearning | DynamicProgramming
 Points = Callable[[Tensor], Float[Tensor, "... 2"]]
@@ -39,6 +38,7 @@ class Setting:
         threshold: mean return of the greedy policy.
         frames: environment steps of each learner.
         every: environment steps between evaluations.
+        starts: episodes of an evaluation.
         goal: reward of a step that counts as being in the goal region.
         place: observations to two coordinates.
         low, high: the plane's range.
@@ -51,6 +51,7 @@ class Setting:
     threshold: float
     frames: int
     every: int
+    starts: int
     goal: float
     place: Points
     low: tuple[float, float]
@@ -82,6 +83,7 @@ BY_VALUES = {
         threshold=50.0,
         frames=1_500,
         every=100,
+        starts=2,
         goal=0.5,
         place=_angle_and_speed,
         low=(-math.pi, -10.0),
@@ -95,6 +97,7 @@ BY_VALUES = {
         threshold=90.0,
         frames=3_000,
         every=500,
+        starts=2,
         goal=50.0,
         place=lambda observation: observation,
         low=(-1.2, -0.07),
@@ -105,9 +108,10 @@ BY_VALUES = {
         "atwood",
         "q-learning",
         CHEAPER | {"discount": 0.95},
-        threshold=100.0,  # at most 200 steps of at most 1: for more than half of them near the wanted swing
+        threshold=50.0,  # a controller that knows the machine and holds the length attains 100
         frames=1_500,
         every=200,
+        starts=6,  # which differ more
         goal=0.8,
         place=_swing_angle_and_length,
         low=(-math.pi, 0.3),
@@ -128,7 +132,7 @@ def _by_plans(task: str, frames: int, every: int) -> Setting:
 BY_PLANS = {
     "pendulum-explore": _by_plans("pendulum-explore", 800, 50),
     "MountainCarContinuous-v0": _by_plans("MountainCarContinuous-v0", 2_500, 500),
-    "atwood": _by_plans("atwood", 1_500, 150),
+    "atwood": _by_plans("atwood", 1_000, 100),
 }
 SETTINGS = {"q-learning": BY_VALUES, "dynamic-programming": BY_PLANS}
 
@@ -246,7 +250,12 @@ def run(
     setting: Setting, numbers: dict[str, Any], learners: range, frames: int
 ) -> Iterator[tuple[Learner, Outcome]]:
     """Train one arm; yields after each evaluation."""
-    options = {"learners": len(learners), "num_envs": STARTS, "threads": 1, "first_learner": learners.start}
+    options = {
+        "learners": len(learners),
+        "num_envs": setting.starts,
+        "threads": 1,
+        "first_learner": learners.start,
+    }
     learner = start(setting, numbers, learners, frames)
     watched = Watched(learner)
     learner.collection = watched  # pyright: ignore[reportAttributeAccessIssue]

@@ -13,12 +13,17 @@ import train
 
 POLICY_GRADIENT = "policy-gradient --rollout-steps 20 --total-frames 320 --budget 15"
 Q_LEARNING = "q-learning --rollout-steps 10 --total-frames 160 --budget 15 --sweeps 3"
-OTHERS = [
+EVERY_LEARNER = [
+    POLICY_GRADIENT,
     Q_LEARNING,
     "actor-critic --rollout-steps 10 --total-frames 160 --budget 15 --first-frames 40 --batch 16",
     "dynamic-programming --rollout-steps 10 --total-frames 160 --model-budget 15 --support 20 --sweeps 3",
+]
+OTHERS = [
     f"{POLICY_GRADIENT} --critic neural",
     f"{POLICY_GRADIENT} --targets differences --estimator all-action --replay 100",
+    f"{POLICY_GRADIENT} --targets differences --replay 100 --replay-storage disk",
+    f"{Q_LEARNING} --replay-storage disk",
     f"{POLICY_GRADIENT} --task HalfCheetah-v5",  # starts are drawn by Gymnasium's generators
     f"{Q_LEARNING} --exploration gibbs",
     f"{Q_LEARNING} --exploration thompson",
@@ -110,6 +115,6 @@ def test_a_run_that_filled_the_disk_resumes_bit_for_bit(undisturbed, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("undisturbed", [POLICY_GRADIENT], indirect=True)
+@pytest.mark.parametrize("undisturbed", EVERY_LEARNER, indirect=True)
 def test_a_killed_run_resumes_bit_for_bit_wherever_it_was_killed(undisturbed, tmp_path):
     kill_points(undisturbed, tmp_path, 20)

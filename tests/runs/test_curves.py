@@ -7,6 +7,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torch_gprl.runs import MetricsWriter, UserError, check_logger, curves, read_metrics
+from torch_gprl.runs.curves import Curves
 
 
 def values(update: int) -> dict[str, torch.Tensor]:
@@ -26,7 +27,7 @@ def test_csv_means_the_table_alone(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
 
 
-@pytest.mark.parametrize("name", ["wandb", "mlflow"])
+@pytest.mark.parametrize("name", ["wandb", "mlflow", "trackio"])
 def test_a_missing_package_is_named(name, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda package: None)
     with pytest.raises(UserError, match=f"logger '{name}' needs the package {name}: pip install {name}"):
@@ -59,6 +60,54 @@ def test_other_loggers_get_one_curve_for_each_learner_and_the_mean(tmp_path, mon
         ("return/learner-1", 3.0, 10),
     ]
     assert logger.closed
+
+
+@pytest.mark.parametrize("server", [None, "http://tracking"])
+def test_mlflow_writes_to_its_server_or_to_a_database_of_the_run(server, tmp_path, monkeypatch):
+    made = []
+
+    def record(self, *given: str, **options: str | None) -> None:
+        made.append((*given, options))
+
+    monkeypatch.setattr(curves.MLFlowLogger, "__init__", record)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    if server is not None:
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", server)
+    folder = tmp_path / "my-run" / "mlflow"
+    Curves("mlflow", folder, learners=2)
+    own = (f"sqlite:///{folder}/mlflow.db", {"artifact_location": folder.as_uri()})
+    assert made == [("my-run", *(own if server is None else (server, {"artifact_location": None})))]
+    assert folder.is_dir()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # MLflow's own
+def test_mlflow_itself_keeps_every_point(tmp_path, monkeypatch):
+    mlflow = pytest.importorskip("mlflow", reason="needs mlflow")
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    writer = MetricsWriter(tmp_path / "metrics.csv", tmp_path / "mlflow", logger="mlflow")
+    for update in (1, 2):
+        writer.write(update, 10 * update, values(update))
+    writer.close()
+    run = mlflow.last_active_run().info.run_id
+    for name, expected in (("mean", [2.0, 4.0]), ("learner-1", [3.0, 6.0])):
+        points = mlflow.MlflowClient().get_metric_history(run, f"return/{name}")
+        assert [(point.step, point.value) for point in points] == list(zip((10, 20), expected, strict=True))
+    mlflow.end_run()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # W&B's own
+def test_wandb_itself_keeps_every_point(tmp_path, monkeypatch):
+    wandb = pytest.importorskip("wandb", reason="needs wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    writer = MetricsWriter(tmp_path / "metrics.csv", tmp_path / "wandb", logger="wandb")
+    for update in (1, 2):
+        writer.write(update, 10 * update, values(update))
+    assert wandb.run.summary["return/mean"] == 4.0
+    assert wandb.run.summary["return/learner-1"] == 6.0
+    writer.close()
+    assert list(tmp_path.rglob("*.wandb"))
 
 
 def test_a_resumed_run_replaces_what_came_after_its_checkpoint(tmp_path):

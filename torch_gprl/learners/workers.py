@@ -134,7 +134,8 @@ class WorkerCollection:
         reports = sorted(Path(self._folder.name).glob("worker-*.txt")) if self._folder else []
         if reports:
             return "; ".join(f"{path.stem}: {path.read_text(encoding='utf-8')}" for path in reports)
-        codes = enumerate(map(_exit_code, self._collector.procs if self._collector else []))
+        processes = [] if self._collector is None else self._collector.procs
+        codes = enumerate(map(_exit_code, processes))
         return "; ".join(f"worker-{i} ended with exit code {code}" for i, code in codes if code)
 
     def close(self) -> None:

@@ -1,6 +1,7 @@
 """The metrics for the eye: TensorBoard's events, or another of TorchRL's loggers."""
 
 import importlib.util
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -8,11 +9,12 @@ from typing import Any, Literal
 import numpy as np
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
 from torchrl.record.loggers import get_logger
+from torchrl.record.loggers.mlflow import MLFlowLogger
 
 from torch_gprl.runs.errors import UserError
 
-LoggerName = Literal["csv", "tensorboard", "wandb", "mlflow"]
-OPTIONAL = ("wandb", "mlflow")  # packages of the same names that a user may lack
+LoggerName = Literal["csv", "tensorboard", "wandb", "mlflow", "trackio"]
+OPTIONAL = ("wandb", "mlflow", "trackio")  # packages of the same names that a user may lack
 
 
 def check_logger(name: LoggerName) -> None:
@@ -45,6 +47,8 @@ class Curves:
         self._loggers: list[Any] = []
         if logger == "tensorboard":
             self._loggers = [get_logger(logger, str(directory), label) for label in self._labels]
+        elif logger == "mlflow":
+            self._loggers = [_mlflow_logger(directory)]
         elif logger != "csv":
             self._loggers = [get_logger(logger, str(directory), directory.parent.name)]
         if logger == "tensorboard" and after is not None:
@@ -71,3 +75,12 @@ class Curves:
         """Write out what is pending."""
         for logger in self._loggers:
             logger.close()
+
+
+def _mlflow_logger(directory: Path) -> MLFlowLogger:
+    """The server of MLFLOW_TRACKING_URI, or a database of the run: MLflow no longer writes plain files."""
+    directory.mkdir(parents=True, exist_ok=True)
+    own = f"sqlite:///{directory.absolute() / 'mlflow.db'}"
+    server = os.environ.get("MLFLOW_TRACKING_URI", own)
+    place = directory.absolute().as_uri() if server == own else None
+    return MLFlowLogger(directory.parent.name, server, artifact_location=place)

@@ -17,8 +17,10 @@ from torch import Tensor
 
 from torch_gprl.critics.gaussian_actions import action_moments, clipped_moments
 from torch_gprl.gp import Posterior, SparseOnlineGP
-from torch_gprl.gp.prescribed import adopt_basis, observe_anew
+from torch_gprl.gp.prescribed import adopt_basis, observe
 from torch_gprl.kernels import GaussianInputs
+
+BLOCK = 1024  # transitions that `resolve` takes at a time: larger matrices leave the processor's cache
 
 
 class GPActionValue(TensorDictModuleBase):
@@ -238,15 +240,18 @@ class GPActionValue(TensorDictModuleBase):
             policy: Gaussian policy whose value is learned.
             discount: γ per step.
         """
-        inputs, averaged, rate, target = self._differences(tensordict, policy, discount)
         gp = self.gp
         gp.refresh()
+        gp.forget()
         rows = int(gp.size.max())
         basis, mask = gp.basis[..., :rows, :], gp.mask[..., None, :rows]
-        # Q(s, a) − γ E_a' Q(s', a') in the weights of the basis
-        rate = rate.unsqueeze(-1)
-        ahead = torch.where(rate > 0, rate * gp.kernel.expected(averaged, basis), 0.0)
-        observe_anew(gp, (gp.kernel(inputs, basis) - ahead) * mask, target)
+        flat = tensordict.reshape(*gp.batch_shape, -1)
+        for block in flat.split(BLOCK, len(gp.batch_shape)):
+            inputs, averaged, rate, target = self._differences(block, policy, discount)
+            # Q(s, a) − γ E_a' Q(s', a') in the weights of the basis
+            rate = rate.unsqueeze(-1)
+            ahead = torch.where(rate > 0, rate * gp.kernel.expected(averaged, basis), 0.0)
+            observe(gp, (gp.kernel(inputs, basis) - ahead) * mask, target)
 
     def _differences(
         self, tensordict: TensorDictBase, policy: ProbabilisticTensorDictSequential, discount: float

@@ -48,10 +48,10 @@ def adopt_basis(
 
 
 @torch.no_grad()
-def observe_anew(
+def observe(
     gp: SparseOnlineGP, design: Float[Tensor, "*batch N R"], targets: Float[Tensor, "*batch N"]
 ) -> None:
-    """Forget all data, and learn y = X α + noise, with X the design and α = K⁻¹u the weights of the basis.
+    """Learn y = X α + noise, with X the design and α = K⁻¹u the weights of the basis.
 
     The posterior mean is then k(x, X_B) α with the α that solves (XᵀX/σ0² + K) α = Xᵀy/σ0². What the basis
     misses of an observation counts as explained (the form "dtc").
@@ -64,10 +64,17 @@ def observe_anew(
     rows, noise = design.shape[-1], gp.noise_variance.unsqueeze(-1)
     # whitened before it is summed: L⁻¹(XᵀX)L⁻ᵀ would lose its digits where K is ill-conditioned
     phi = solve_triangular(gp.gram_factor[..., :rows, :rows], design.mT)
-    gp.forget()
     gp.precision[..., :rows, :rows] += phi @ phi.mT / noise.unsqueeze(-1)
-    gp.information[..., :rows] = (phi @ targets.unsqueeze(-1)).squeeze(-1) / noise
+    gp.information[..., :rows] += (phi @ targets.unsqueeze(-1)).squeeze(-1) / noise
     count, noise = targets.shape[-1], gp.noise_variance
     quadratic = targets.square().sum(-1) / noise
-    gp.evidence_constant.copy_(-0.5 * (quadratic + count * (2 * math.pi * noise).log()))
-    gp.observations.fill_(count)
+    gp.evidence_constant.add_(-0.5 * (quadratic + count * (2 * math.pi * noise).log()))
+    gp.observations.add_(count)
+
+
+def observe_anew(
+    gp: SparseOnlineGP, design: Float[Tensor, "*batch N R"], targets: Float[Tensor, "*batch N"]
+) -> None:
+    """Forget all data, and `observe` these."""
+    gp.forget()
+    observe(gp, design, targets)

@@ -14,6 +14,7 @@ import pytest
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(DOCS.glob("**/*.md"))
 EXAMPLE = re.compile(r"```python\n(.*?)```(?:\s+```text\n(.*?)```)?", flags=re.DOTALL)
+TESTS = [test for page in PAGES for test in re.findall(r"tests/[\w/]+\.py::\w+", page.read_text("utf-8"))]
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 
@@ -40,6 +41,12 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page, tmp_path, m
         assert numbers == pytest.approx([float(number) for number in NUMBER.findall(expected)], rel=0.1)
     for picture in tmp_path.iterdir():  # the page shows the pictures that its code makes
         assert f"]({picture.name})" in text
+
+
+@pytest.mark.parametrize("test", TESTS)
+def test_a_test_that_a_page_names_exists(test):
+    file, function = test.split("::")
+    assert f"def {function}(" in (DOCS.parent / file).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)

@@ -70,7 +70,7 @@ def test_doubt_grows_away_from_the_data():
 
 
 def test_values_are_those_of_value_iteration_on_a_fine_table():
-    value = planned(walk(), discount=0.9, tremble=0.01)
+    value = planned(walk(), discount=0.9, tremble=0.01, hold=1)
     states, values = by_tables(0.9)
     best = value.best_action(grid(), explore=False)
     found = value.action_values(grid(), best, explore=False)
@@ -106,6 +106,21 @@ def test_a_trembling_hand_keeps_away_from_an_edge():
     steady, careful = (planned(data, tremble=tremble).best_action(near, False) for tremble in (0.01, 0.25))
     assert (careful < -0.3).all()
     assert (careful <= steady).all()
+
+
+def test_a_held_action_is_followed_to_the_end_that_it_leads_to():
+    """Every step is paid 1 until the end beyond 1; who chooses anew in every step can turn back before it."""
+    data = walk(end=1.0)
+    data = data._replace(reward=torch.ones_like(data.reward))
+    near, towards = torch.full((2, 1, 1), 0.5, dtype=torch.float64), torch.ones(2, 1, 1, dtype=torch.float64)
+    held, free = (
+        planned(data, discount=0.9, hold=hold, tremble=0.01).action_values(near, 0.7 * towards, explore=False)
+        for hold in (3, 1)
+    )
+    torch.testing.assert_close(
+        held, torch.full_like(held, 1 + 0.9), rtol=0, atol=0.5
+    )  # ends at 0.5 + 2 · 0.35
+    assert (free > 4).all()  # of at most 10
 
 
 def test_values_keep_to_the_attainable_range():

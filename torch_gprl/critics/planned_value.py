@@ -5,6 +5,10 @@ on support states, and each sweep sets it there to
 
     V(s) = max_a r̂(s, a) + γ (1 − end(ŝ')) V(ŝ'),   ŝ' the model's prediction
 
+Actions are held for a few steps, in sweeps and when actions are compared: what follows from them then differs
+by more than the error of the values between support states, and a step errs less often on its way to the
+reward. An agent still chooses anew at every step.
+
 The process has a Matérn 1/2 kernel. Its predictions are nearly convex combinations of the values at the
 support, so sweeps nearly contract; a smoother kernel overshoots and the maximum then feeds on it. Values also
 keep to the attainable range. Support states are visited ones, states a few imagined steps away, and the ends
@@ -54,6 +58,8 @@ class Planning:
     novelty_lengthscale: float = 0.5  # in which a state counts as new, likewise
     tremble: float = 0.25  # standard deviation of actions that is planned for, in halves of their range
     optimism: float = 1.0  # the unknown is hoped to hold the best seen, and so many attainable ranges more
+    hold: int = 2  # environment steps that an action is held for
+    smoothness: float = 0.5  # of values, as in Matérn kernels: 0.5, 1.5 or 2.5
 
 
 class _Support(NamedTuple):
@@ -75,6 +81,15 @@ class _Seen(NamedTuple):
     labels: Tensor  # [L, R]
     label_weights: Tensor  # [L, R, 1]
     novelty_factor: Tensor  # [L, R, R]
+
+
+class _Course(NamedTuple):
+    """Where an action leads that is held for some steps."""
+
+    observation: Tensor  # [L, N, S] in the end
+    reward: Tensor  # [L, N] in all, discounted
+    lasting: Tensor  # [L, N] the chance, 0 to 1, that the task goes on
+    doubt: Tensor  # [L, N] about the first step, as `Prediction`
 
 
 class PlannedValue:
@@ -140,7 +155,7 @@ class PlannedValue:
         """Of values and of novelty, in scaled coordinates, where the length scale of values is 1."""
         columns = like.shape[-1]
         narrow = self.planning.novelty_lengthscale / self.planning.lengthscale
-        self._kernel = Matern(columns, smoothness=0.5).to(like).requires_grad_(False)
+        self._kernel = Matern(columns, smoothness=self.planning.smoothness).to(like).requires_grad_(False)
         self._novelty_kernel = SquaredExponential(columns, narrow).to(like).requires_grad_(False)
         return self._kernel, self._novelty_kernel
 
@@ -213,10 +228,9 @@ class PlannedValue:
         assert support is not None
         learners, count, _ = support.observation.shape
         spread = support.observation.repeat_interleave(len(actions), 1)
-        step = self.model.predict(spread, actions.repeat(count, 1).expand(learners, -1, -1))
-        lasting = self.planning.discount * (1 - self._end(step.observation))
-        unknown = self._unknown(step.observation, step.doubt, lasting)
-        cross = self._kernel(self._scaled(step.observation), support.scaled)
+        course = self._course(spread, actions.repeat(count, 1).expand(learners, -1, -1), doubt=True)
+        unknown, weight = self._unknown(course), self._beyond * course.lasting.unsqueeze(-1)
+        cross = self._kernel(self._scaled(course.observation), support.scaled)
         eye = torch.eye(support.scaled.shape[1], dtype=cross.dtype, device=cross.device)
         factor = cholesky(self._kernel(support.scaled, support.scaled) + VALUE_NOISE * eye)
         lowest, highest = self._range()
@@ -224,11 +238,26 @@ class PlannedValue:
         for _ in range(sweeps):
             weights = torch.cholesky_solve(self._residual(values), factor)
             beyond = torch.clamp(cross @ weights + support.prior, lowest, highest)
-            backup = step.reward.unsqueeze(-1) + lasting.unsqueeze(-1) * beyond
+            backup = course.reward.unsqueeze(-1) + weight * beyond
             backup = torch.lerp(backup, highest.expand_as(backup), unknown)
             values = (trembling @ backup.unflatten(1, (count, -1))).amax(2)
         weights = torch.cholesky_solve(self._residual(values), factor)
         self._support = support._replace(weights=weights)
+
+    @property
+    def _beyond(self) -> float:
+        """Discount of what comes after an action."""
+        return self.planning.discount**self.planning.hold
+
+    def _course(self, observation: Tensor, action: Tensor, doubt: bool) -> _Course:
+        """What holding actions leads to."""
+        step = self.model.predict(observation, action, doubt)
+        reward, lasting, unsure = step.reward, 1 - self._end(step.observation), step.doubt
+        for held in range(1, self.planning.hold):
+            step = self.model.predict(step.observation, action, doubt=False)
+            reward = reward + self.planning.discount**held * lasting * step.reward
+            lasting = lasting * (1 - self._end(step.observation))
+        return _Course(step.observation, reward, lasting, unsure)
 
     def _trembling(self, actions: Float[Tensor, "J A"]) -> Float[Tensor, "J J"]:
         """Weights by which the value of an action is averaged over actions near it."""
@@ -244,9 +273,9 @@ class PlannedValue:
         )
         return torch.cat([values - support.prior, at_ends.expand(-1, support.ends.shape[1], -1)], 1)
 
-    def _unknown(self, following: Tensor, doubt: Tensor, lasting: Tensor) -> Float[Tensor, "L N 2"]:
+    def _unknown(self, course: _Course) -> Float[Tensor, "L N 2"]:
         """Share of a backup that is not known, for both values; zero for the one that exploits."""
-        new = torch.maximum(doubt, self._novelty(following) * lasting / self.planning.discount)
+        new = torch.maximum(course.doubt, self._novelty(course.observation) * course.lasting)
         return torch.stack([torch.zeros_like(new), new], -1)
 
     def _range(self) -> tuple[Float[Tensor, "L 1 1"], Float[Tensor, "L 1 2"]]:
@@ -265,16 +294,14 @@ class PlannedValue:
     def action_values(
         self, observation: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"], explore: bool
     ) -> Float[Tensor, "L N"]:
-        """r̂ + γ V(ŝ') of actions in halves of the actuator's range."""
+        """r̂ + γ V(ŝ') of actions in halves of the actuator's range, each held for `Planning.hold` steps."""
         assert self._support is not None
-        step = self.model.predict(observation, action, doubt=explore)
-        lasting = self.planning.discount * (1 - self._end(step.observation))
-        column = EXPLORE if explore else EXPLOIT
-        value = step.reward + lasting * self._values_of(self._support, step.observation)[..., column]
+        course = self._course(observation, action, doubt=explore)
+        after = self._values_of(self._support, course.observation)[..., EXPLORE if explore else EXPLOIT]
+        value = course.reward + self._beyond * course.lasting * after
         if not explore:
             return value
-        unknown = self._unknown(step.observation, step.doubt, lasting)[..., EXPLORE]
-        return torch.lerp(value, self._hope.expand_as(value), unknown)
+        return torch.lerp(value, self._hope.expand_as(value), self._unknown(course)[..., EXPLORE])
 
     def best_action(self, observation: Float[Tensor, "L N S"], explore: bool) -> Float[Tensor, "L N A"]:
         """The best of the candidate actions, in halves of the actuator's range."""

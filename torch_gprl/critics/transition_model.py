@@ -19,7 +19,7 @@ from torch_gprl.kernels import Kernel, Linear, SquaredExponential
 from torch_gprl.linalg import CholeskyError, cholesky
 
 FIRST_NOISE, NOISE_FLOOR = 1e-3, 1e-5  # variances, of standardised targets
-FIT_POINTS, FIT_STEPS = 200, 40  # data and optimiser steps of a fit of hyper-parameters
+FIT_POINTS, FIT_STEPS = 100, 40  # data and optimiser steps of a fit of hyper-parameters
 MARGIN = 0.1  # predictions stay in the range of what was seen, widened by this share on either side
 
 

@@ -16,6 +16,7 @@ LEAST = {
     "sweeps": 1,
     "backup_actions": 3,
     "acting_actions": 3,
+    "hold": 1,
     "optimism": 0,
     "growth": 0,
 }
@@ -41,6 +42,8 @@ class DynamicProgrammingConfig(PlannedBehaviour):
     lengthscale: float = 2.0  # of values, in standard deviations of the observations times √columns
     novelty_lengthscale: float = 0.5  # in which a state counts as new, likewise
     tremble: float = 0.25  # standard deviation of actions to plan for, in halves of the actuator's range
+    hold: int = 2  # environment steps that a plan holds an action for; acting chooses anew at every step
+    smoothness: float = 0.5  # of values, as in Matérn kernels: 0.5, 1.5 or 2.5
 
     optimism: float = 1.0  # exploring hopes for the best seen and so many ranges of value more
 
@@ -66,4 +69,6 @@ class DynamicProgrammingConfig(PlannedBehaviour):
             self.novelty_lengthscale,
             self.tremble,
             self.optimism,
+            self.hold,
+            self.smoothness,
         )

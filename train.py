@@ -96,8 +96,23 @@ class Options(Protocol):
     algorithm: Any  # the numbers of the algorithm
 
 
+# A critic of all experience, and ten steps of the policy by it for every 200 of the environments.
+ALL_ACTION_REPLAY: dict[str, object] = {
+    "total_frames": 13_000,
+    "rollout_steps": 40,
+    "discount": 0.95,
+    "estimator": "all-action",
+    "targets": "differences",
+    "exploration": "fixed",
+    "replay": 4_000,
+    "improvements": 10,
+    "damping": 0.05,
+    "noise": 0.001,
+    "lengthscale": 1.0,
+}
 # A rollout holds whole episodes, and values look ahead as far as the task's steps are short.
 POLICY_GRADIENT_PRESETS: dict[str, dict[str, object]] = {
+    "Pendulum-v1": ALL_ACTION_REPLAY,
     "pendulum-explore": {"discount": 0.97},
     "cartpole-balance": {"rollout_steps": 500, "discount": 0.99},
     "cartpole-swingup": {"rollout_steps": 250, "total_frames": 300_000},

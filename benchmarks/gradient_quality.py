@@ -40,7 +40,8 @@ from benchmarks.gradient_truth import Branches, branches
 from torch_gprl.critics import GPActionValue
 from torch_gprl.learners import PolicyGradientConfig
 
-SIDE_BY_SIDE = 40  # batches, as learners of one program; all counts of batches are rounded up to it
+SIDE_BY_SIDE = 20  # batches, as learners of one program; all counts of batches are rounded up to it
+QUICK = 40  # batches
 POOLED_SEED, BRANCHES_SEED = 2_000_000, 3_000_000
 FIGURES = {
     "nsr": "noise: tr Cov / ‖mean‖²",
@@ -68,8 +69,8 @@ def main(options: Options) -> None:
     if options.quick:
         options = dataclasses.replace(
             options,
-            batches=SIDE_BY_SIDE,
-            reference_batches=SIDE_BY_SIDE,
+            batches=QUICK,
+            reference_batches=QUICK,
             task=options.task or SETTINGS[0].task,
         )
     settings = [setting for setting in SETTINGS if options.task in (None, setting.task)]

@@ -1,21 +1,20 @@
 """The kernels that `graph_kernels` compares, and how each is tuned, fed and judged, all in the same way.
 
 Hyper-parameters maximise the marginal likelihood of held-out trajectories: those of the graph kernels are
-tuned on a graph that lacks them, since a graph tells more of its own vertices than of new states. The sparse
-online process then learns from all trajectories in random blocks, graphs growing along.
+tuned on a graph that lacks them, since a graph tells more of its own vertices than of new states. Graphs of
+visited states are measured in units that a Matérn 3/2 kernel, tuned on the same trajectories, suggests. The
+sparse online process then learns from all trajectories in random blocks, graphs growing along.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import LogNormal
 
 from benchmarks.graph_systems import DISCOUNT, Trajectories
-from torch_gprl.critics.kernels_by_name import successor_with_rest
 from torch_gprl.gp import Posterior, SparseOnlineGP, fit_hyperparameters
 from torch_gprl.graphs import Experience, NearestEdges, ThresholdEdges, TransitionGraph
 from torch_gprl.kernels import (
@@ -25,6 +24,7 @@ from torch_gprl.kernels import (
     Matern,
     ShortestPathKernel,
     SquaredExponential,
+    SuccessorWithRest,
 )
 
 BLOCK = 250  # points of one update
@@ -35,7 +35,6 @@ HELD_OUT = 2  # one trajectory in so many is held out of the graph while its ker
 NEIGHBOURS = 4
 PRINTED_THRESHOLD = 0.7
 LOOKAHEAD = 20  # steps
-WIDE = 1.5  # standard deviation of logarithms of the amplitudes of a mixture
 
 Graph = TransitionGraph | Experience | None
 
@@ -46,6 +45,7 @@ class Arm:
 
     graph: Callable[[int, int], Graph]  # from input columns and the number of transitions that will be stored
     kernel: Callable[[Graph, int], Kernel]  # from the graph and input columns
+    suited: bool = True  # units of visited states by an ordinary kernel; else those of the inputs
 
 
 def _nodes(dims: int, transitions: int) -> TransitionGraph:
@@ -68,28 +68,12 @@ def _on_nodes(kernel: Callable[[TransitionGraph], Kernel]) -> Arm:
     return Arm(_nodes, make)
 
 
-def _on_experience(kernel: Callable[[Experience], Kernel]) -> Arm:
+def _on_experience(kernel: Callable[[Experience], Kernel], suited: bool = True) -> Arm:
     def make(graph: Graph, dims: int) -> Kernel:
         assert isinstance(graph, Experience)
         return kernel(graph)
 
-    return Arm(_visited, make)
-
-
-def _geodesic_mixed(visited: Experience) -> Kernel:
-    """The sum with an ordinary kernel; the marginal likelihood says how much of each."""
-    told = GeodesicKernel(visited, DISCOUNT, outputscale=0.5)
-    ordinary = Matern(told.input_dim, outputscale=0.5)
-    for kernel in (told, ordinary):
-        kernel.set_prior("outputscale", LogNormal(-1.0, WIDE))
-    return told + ordinary
-
-
-def _successor_mixed(visited: Experience) -> Kernel:
-    """The successor kernel with what it cannot tell, and a smooth kernel of any amplitude beside it."""
-    ordinary = Matern(visited.states.shape[-1], outputscale=0.2)
-    ordinary.set_prior("outputscale", LogNormal(-1.0, WIDE))
-    return successor_with_rest(visited, DISCOUNT, 1.0, LOOKAHEAD) + ordinary
+    return Arm(_visited, make, suited)
 
 
 EUCLIDEAN = {
@@ -107,12 +91,11 @@ ON_GRAPHS = {
     ),
     "graph Matérn 3/2": _on_nodes(lambda graph: GraphMatern(graph, interpolate=NEIGHBOURS)),
     "geodesic": _on_experience(lambda visited: GeodesicKernel(visited, DISCOUNT)),
-    "successor, no look-ahead": _on_experience(
-        lambda visited: successor_with_rest(visited, DISCOUNT, 1.0, 0)
+    "successor, no look-ahead": _on_experience(lambda visited: SuccessorWithRest(visited, DISCOUNT, 1.0, 0)),
+    "successor, units of the inputs": _on_experience(
+        lambda visited: SuccessorWithRest(visited, DISCOUNT), suited=False
     ),
-    "successor": _on_experience(lambda visited: successor_with_rest(visited, DISCOUNT, 1.0, LOOKAHEAD)),
-    "geodesic + Matérn 3/2": _on_experience(_geodesic_mixed),
-    "successor + Matérn 3/2": _on_experience(_successor_mixed),
+    "successor": _on_experience(lambda visited: SuccessorWithRest(visited, DISCOUNT)),
 }
 ARMS = EUCLIDEAN | ON_GRAPHS
 
@@ -130,29 +113,51 @@ class Tuned:
         start = time.perf_counter()
         kept = torch.arange(len(seen.targets)) % HELD_OUT != 0
         grow(self.graph, seen, kept)
-        gp = SparseOnlineGP(self.kernel, TUNING_NODES, noise)
         held_out, targets = seen.states[~kept].flatten(0, 1), seen.targets[~kept].flatten()
         chosen = torch.randperm(len(targets))[:TUNING_POINTS]
-        fit_hyperparameters(gp, held_out[chosen], targets[chosen], steps, noise_floor=noise / 4)
+
+        def fit(kernel: Kernel) -> SparseOnlineGP:
+            gp = SparseOnlineGP(kernel, TUNING_NODES, noise)
+            fit_hyperparameters(gp, held_out[chosen], targets[chosen], steps, noise_floor=noise / 4)
+            return gp
+
+        if isinstance(self.graph, Experience) and arm.suited:
+            ordinary = Matern(dims)
+            fit(ordinary)
+            suit(self.kernel, self.graph, ordinary.lengthscale.detach())
+        gp = fit(self.kernel)
         self.noise = gp.noise_variance.detach()
         if isinstance(self.graph, Experience):
             grow(self.graph, seen, ~kept)
         self.seconds = time.perf_counter() - start
 
+    def together(self, budgets: Sequence[int]) -> list[Sequence[int]]:
+        """Budgets in groups that can learn at once: a graph of basis vectors is that of one basis alone."""
+        return [[budget] for budget in budgets] if isinstance(self.graph, TransitionGraph) else [budgets]
+
     @torch.no_grad()
-    def learn(self, budget: int, seed: int) -> tuple[SparseOnlineGP, float]:
-        """A process of so many basis vectors that has learned all trajectories, and the seconds it took."""
+    def learn(self, budgets: Sequence[int], seed: int) -> list[SparseOnlineGP]:
+        """Processes of so many basis vectors that have learned all trajectories."""
         if isinstance(self.graph, TransitionGraph):
             self.graph.eliminate(self.graph.mask)
-        gp = SparseOnlineGP(self.kernel, budget, self.noise)
-        start = time.perf_counter()
+        processes = [SparseOnlineGP(self.kernel, budget, self.noise) for budget in budgets]
         order = torch.randperm(self.seen.targets.numel(), generator=torch.Generator().manual_seed(seed))
         states, targets = self.seen.states.flatten(0, 1), self.seen.targets.flatten()
-        for block in order.split(BLOCK):
-            gp.update(states[block], targets[block])
-            if isinstance(self.graph, TransitionGraph):
-                self.graph.follow(gp.basis, gp.mask)
-        return gp, time.perf_counter() - start
+        for rows in order.split(BLOCK):
+            block = states[rows]  # one tensor for all, so that kernels need not look at it twice
+            for gp in processes:
+                gp.update(block, targets[rows])
+                if isinstance(self.graph, TransitionGraph):
+                    self.graph.follow(gp.basis, gp.mask)
+        return processes
+
+
+def suit(kernel: Kernel, visited: Experience, lengthscale: Float[Tensor, " D"]) -> None:
+    """Measure visited states as values that vary over this length scale want it."""
+    if isinstance(kernel, SuccessorWithRest):
+        kernel.suit(lengthscale)
+    else:
+        visited.measure(visited.pulled_back(lengthscale, DISCOUNT))
 
 
 def grow(graph: Graph, seen: Trajectories, which: Tensor) -> None:

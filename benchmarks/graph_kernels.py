@@ -149,12 +149,15 @@ def learn(kernel: str, truth: Truth, seen: Trajectories, seed: int, options: Opt
             yield Learned(kernel, budget, posterior, 0.0, time.perf_counter() - start, 0.0)
         return
     tuned = Tuned(ARMS[kernel], seen, seed, options.tuning_steps, noise)
-    for budget in (*budgets, MEMORY) if kernel == REMEMBERS else budgets:
-        gp, seconds = tuned.learn(budget, seed)
+    for group in tuned.together((*budgets, MEMORY) if kernel == REMEMBERS else budgets):
         start = time.perf_counter()
+        learned = tuned.learn(group, seed)
+        middle = time.perf_counter()
         with torch.no_grad():
-            posterior = gp.posterior(queries)
-        yield Learned(kernel, budget, posterior, tuned.seconds, seconds, time.perf_counter() - start)
+            posteriors = [gp.posterior(queries) for gp in learned]
+        seconds = [s / len(group) for s in (middle - start, time.perf_counter() - middle)]
+        for budget, posterior in zip(group, posteriors, strict=True):
+            yield Learned(kernel, budget, posterior, tuned.seconds, *seconds)
 
 
 def score(problem: System, truth: Truth, seed: int, learned: Learned) -> Score:

@@ -27,7 +27,7 @@ class Score:
     rmse_far: float
     nlpd: float  # negative log predictive density of the true value
     tuning: float  # s
-    learning: float  # s
+    learning: float  # s, shared with the other budgets
     predicting: float  # s, for all states that are judged
 
 

@@ -142,3 +142,62 @@ def test_mistakes_are_named():
         Experience(2, 5, 3, slope_neighbours=5)
     with pytest.raises(ValueError, match="landmarks must be from 1 to the capacity 20"):
         Experience(2, 20, 21)
+
+
+def linear_experience(A: Tensor, *batch: int) -> Experience:
+    """Trajectories of x' = A x."""
+    path = [torch.randn(*batch, 12, len(A), dtype=torch.float64)]
+    for _ in range(6):
+        path.append(path[-1] @ A.mT)
+    states = torch.stack(path, -2)
+    experience = Experience(len(A), 80, 10, batch_shape=batch)
+    experience.add(states[..., :-1, :].flatten(-3, -2), states[..., 1:, :].flatten(-3, -2))
+    return experience
+
+
+def test_a_graph_in_other_units_is_that_of_inputs_in_these_units():
+    A = torch.tensor([[0.9, -0.3], [0.3, 0.9]], dtype=torch.float64)
+    units = torch.tensor([0.2, 5.0], dtype=torch.float64)
+    experience = linear_experience(A)
+    states, next_states = experience.states[experience.mask], experience.next_states[experience.mask]
+    x = torch.randn(15, 2, dtype=torch.float64)
+    before = experience.nearest(x).nodes
+    experience.measure(units)
+    scaled = Experience(2, 80, 10)
+    scaled.add(states / units, next_states / units)
+    assert not torch.equal(experience.nearest(x).nodes, before)
+    for found, expected in zip(experience.nearest(x), scaled.nearest(x / units), strict=True):
+        torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(experience.landmarks, scaled.landmarks)
+    torch.testing.assert_close(experience.successor(x).point, scaled.successor(x / units).point * units)
+
+
+def test_length_scales_are_pulled_back_along_the_flow():
+    """A position that values want to know makes speed count, and what moves neither does not."""
+    A = torch.tensor([[1.0, 0.1, 0.0], [-0.1, 0.95, 0.0], [0.0, 0.0, 0.9]], dtype=torch.float64)
+    lengthscale, discount = torch.tensor([0.5, 20.0, 2.0], dtype=torch.float64), 0.97
+    experience = linear_experience(A)
+    experience.slopes.copy_(A)
+    found = experience.pulled_back(lengthscale, discount, steps=6)
+    rates = [
+        discount ** (2 * k)
+        * (torch.linalg.matrix_power(A, k).square() / lengthscale.square()[:, None]).sum(0)
+        for k in range(7)
+    ]
+    expected = torch.stack(rates).max(0).values.rsqrt()
+    torch.testing.assert_close(found, expected)
+    assert found[1] < 2
+    torch.testing.assert_close(found[2], lengthscale[2])
+
+
+def test_learners_pull_back_apart_and_nothing_seen_changes_nothing():
+    A = torch.tensor([[0.9, -0.3], [0.3, 0.9]], dtype=torch.float64)
+    lengthscale = torch.tensor([0.3, 4.0], dtype=torch.float64)
+    torch.testing.assert_close(Experience(2, 20, 4).pulled_back(lengthscale, 0.9), lengthscale)
+    torch.manual_seed(3)
+    batch = linear_experience(A, 2)
+    found = batch.pulled_back(lengthscale, 0.9)
+    for learner in range(2):
+        alone = Experience(2, 80, 10)
+        alone.add(batch.states[learner, batch.mask], batch.next_states[learner, batch.mask])
+        torch.testing.assert_close(alone.pulled_back(lengthscale, 0.9), found[learner])

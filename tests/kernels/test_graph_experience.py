@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from torch_gprl.graphs import Experience, TransitionGraph
-from torch_gprl.kernels import GeodesicKernel, Matern, SquaredExponential, SuccessorKernel
+from torch_gprl.kernels import GeodesicKernel, Matern, SquaredExponential, SuccessorKernel, SuccessorWithRest
 from torch_gprl.kernels.graph import TableKernel
 
 DISCOUNT = 0.9
@@ -232,3 +232,30 @@ def test_leading_dimensions_beyond_the_batch_are_more_inputs_of_the_same_learner
     found = kernel(x, z)
     for row in range(3):
         torch.testing.assert_close(found[row], kernel(x[row], z[row]), rtol=0, atol=1e-12)
+
+
+def test_length_scales_of_the_mixture_follow_those_of_values():
+    experience, lengthscale = filled(), torch.tensor([0.4, 9.0], dtype=torch.float64)
+    kernel, x = SuccessorWithRest(experience, DISCOUNT), inputs(6)
+    pulled = experience.pulled_back(lengthscale, DISCOUNT)
+    with torch.no_grad():
+        before = kernel(x, x)
+        kernel.suit(lengthscale)
+        told = SuccessorKernel(experience, DISCOUNT, 2 * pulled)
+        rest = Matern(2, lengthscale, kernel.rest.outputscale, smoothness=0.5)
+        torch.testing.assert_close(kernel(x, x), told(x, x) + rest(x, x))
+        assert not torch.allclose(kernel(x, x), before)
+    torch.testing.assert_close(experience.lengthscale, pulled)
+
+
+def test_only_amplitudes_of_the_mixture_are_fitted_and_with_the_gradient_of_all():
+    kernel, x = SuccessorWithRest(filled(), DISCOUNT), inputs(5)
+    learned = {name for name, parameter in kernel.named_parameters() if parameter.requires_grad}
+    assert {name.split("_", 1)[1] for name in learned} == {"outputscale", "doubt"}
+    kernel(x, x).sum().backward()
+    found = {name: parameter.grad for name, parameter in kernel.named_parameters() if name in learned}
+    kernel.requires_grad_(True).zero_grad()
+    kernel(x, x).sum().backward()
+    for name, parameter in kernel.named_parameters():
+        if name in learned:
+            torch.testing.assert_close(found[name], parameter.grad)

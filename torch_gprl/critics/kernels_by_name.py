@@ -6,7 +6,6 @@ what is saved and moved with the critic. A learner calls `store_transitions` bef
 `follow_basis` afterwards, and `clear_graphs` when it scales the inputs anew.
 """
 
-import math
 from collections.abc import Iterator
 from typing import Literal
 
@@ -14,7 +13,6 @@ import torch
 from jaxtyping import Float
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch.distributions import LogNormal
 
 from torch_gprl.critics.action_value import GPActionValue
 from torch_gprl.graphs import Experience, NearestEdges, TransitionGraph
@@ -25,9 +23,8 @@ from torch_gprl.kernels import (
     Matern,
     ShortestPathKernel,
     SquaredExponential,
-    SuccessorKernel,
+    SuccessorWithRest,
 )
-from torch_gprl.kernels.graph_successor import FIRST_DOUBT
 
 KernelName = Literal[
     "squared-exponential",
@@ -41,8 +38,6 @@ KernelName = Literal[
 SMOOTHNESS = {"matern-1/2": 0.5, "matern-3/2": 1.5, "matern-5/2": 2.5}
 NEIGHBOURS = 4  # of a state on a graph of basis vectors
 LOOKAHEAD = 5  # steps that a state off the graph is followed; more would cost more than they tell
-REST = 0.2  # prior variance of what the successor kernel cannot tell
-PRIOR_WIDTH = 0.3  # standard deviation of logarithms
 
 
 def action_value_kernel(
@@ -89,30 +84,7 @@ def _state_kernel(
     visited = Experience(dims, capacity, min(128, capacity), batch_shape=batch)
     if name == "geodesic":
         return GeodesicKernel(visited, discount, length)
-    return successor_with_rest(visited, discount, length, LOOKAHEAD)
-
-
-def successor_with_rest(visited: Experience, discount: float, lengthscale: float, lookahead: int) -> Kernel:
-    """The successor kernel, with an ordinary one for what it cannot tell and priors that keep this one alive.
-
-    Without priors the marginal likelihood of a few hundred returns, most of them told exactly by the graph,
-    leaves no variance for the few that are not.
-
-    Args:
-        visited: states and transitions.
-        discount: γ, below 1.
-        lengthscale: the first one of both kernels, and the median of its prior, in units of the inputs.
-        lookahead: as `SuccessorKernel`.
-    """
-    dims, batch = visited.states.shape[-1], visited.states.shape[:-2]
-    told = SuccessorKernel(visited, discount, lengthscale, lookahead=lookahead)
-    rest = Matern(dims, lengthscale, REST, batch, smoothness=0.5)
-    for kernel in (told, rest):
-        kernel.set_prior("lengthscale", LogNormal(math.log(lengthscale), PRIOR_WIDTH))
-    told.set_prior("outputscale", LogNormal(0.0, PRIOR_WIDTH))
-    told.set_prior("doubt", LogNormal(math.log(FIRST_DOUBT), PRIOR_WIDTH))
-    rest.set_prior("outputscale", LogNormal(math.log(REST), PRIOR_WIDTH))
-    return told + rest
+    return SuccessorWithRest(visited, discount, length, LOOKAHEAD)
 
 
 def graphs(critic: GPActionValue) -> Iterator[TransitionGraph | Experience]:

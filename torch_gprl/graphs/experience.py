@@ -4,6 +4,13 @@ A stored transition x → x' also tells where inputs near x go: to x' + J (x −
 transitions around it (locally weighted linear regression: Atkeson, Moore and Schaal, 1997). So every input
 has a successor, and the graph reaches beyond its own vertices. Inputs are what the caller makes of states, or
 of states and actions: scaled, and angles as (cos, sin).
+
+Which states are neighbours depends on the units of each column. Those that suit values follow from the length
+scales ℓ of an ordinary kernel of values, pulled back along the flow: with J_k = ∂x_{t+k}/∂x_t,
+
+    1/ℓ̃_d² = max_k median_t γ^{2k} Σ_e (J_k)_ed² / ℓ_e².
+
+A column that values forgive counts for as much as it moves those that they do not.
 """
 
 from collections.abc import Sequence
@@ -49,6 +56,7 @@ class Experience(nn.Module):
     after_weights: Float[Tensor, "*batch C K"]
     ends: Bool[Tensor, "*batch C"]  # no stored transition starts where this one arrives
     landmarks: Int[Tensor, "*batch L"]
+    lengthscale: Float[Tensor, "*batch D"]  # units in which distances between inputs are measured
     size: Int[Tensor, ""]
 
     def __init__(
@@ -81,6 +89,7 @@ class Experience(nn.Module):
         self.register_buffer("after_weights", points.new_zeros(*batch, capacity, interpolate))
         self.register_buffer("ends", torch.zeros(*batch, capacity, dtype=torch.bool))
         self.register_buffer("landmarks", torch.zeros(*batch, landmarks, dtype=torch.long))
+        self.register_buffer("lengthscale", points.new_ones(*batch, input_dim))
         self.register_buffer("size", torch.zeros((), dtype=torch.long))
 
     @property
@@ -117,6 +126,42 @@ class Experience(nn.Module):
             together = torch.cat([buffer[..., kept, :], values.to(buffer)], -2)[..., -self.capacity :, :]
             buffer[..., : together.shape[-2], :] = together
         self.size.fill_(min(held + new, self.capacity))
+        self._renew()
+
+    @torch.no_grad()
+    def measure(self, lengthscale: Float[Tensor, "*#batch D"]) -> None:
+        """Measure distances between inputs in these units from now on; slopes, links and landmarks follow."""
+        self.lengthscale.copy_(lengthscale)
+        self._renew()
+
+    @torch.no_grad()
+    def pulled_back(
+        self, lengthscale: Float[Tensor, "*#batch D"], discount: float, steps: int = 10
+    ) -> Float[Tensor, "*batch D"]:
+        """Length scales ℓ̃ of states for values that vary over `lengthscale`, see the top of this file.
+
+        Without experience they are those of the values.
+
+        Args:
+            lengthscale: ℓ of an ordinary kernel of values [*batch, D], in units of the inputs.
+            discount: γ.
+            steps: most steps k that are looked ahead.
+        """
+        used = slice(int(self.size))
+        slopes, after = self.slopes[..., used, :, :], self.after_nodes[..., used, :1]
+        weight = lengthscale.expand(self.lengthscale.shape).reciprocal().square()
+        if int(self.size) == 0:
+            return weight.rsqrt()
+        flow, node, most = slopes, after, weight
+        for step in range(1, steps + 1):
+            moved = (flow.square() * weight[..., None, :, None]).sum(-2)
+            most = torch.maximum(most, discount ** (2 * step) * moved.median(-2).values)
+            here = gather_rows(slopes.flatten(-2), node).squeeze(-2).unflatten(-1, slopes.shape[-2:])
+            flow, node = here @ flow, gather_rows(after, node).squeeze(-1)
+        return most.rsqrt()
+
+    def _renew(self) -> None:
+        """Slopes, links and landmarks of all that is stored."""
         used = slice(int(self.size))
         self.slopes[..., used, :, :] = self._local_slopes(
             self.states[..., used, :], self.next_states[..., used, :]
@@ -125,13 +170,15 @@ class Experience(nn.Module):
         self.after_nodes[..., used, :] = after.nodes
         self.after_weights[..., used, :] = after.weight
         self.ends[..., used] = (after.distance[..., 0] > COINCIDENT) & ~self.terminated[..., used]
-        chosen = farthest_points(self.states[..., used, :], self.landmarks.shape[-1]).chosen
+        points = self.states[..., used, :] / self.lengthscale.unsqueeze(-2)
+        chosen = farthest_points(points, self.landmarks.shape[-1]).chosen
         # some twice if there are too few
         self.landmarks.copy_(chosen[..., torch.arange(self.landmarks.shape[-1]) % chosen.shape[-1]])
 
     def nearest(self, x: Float[Tensor, "*#batch N D"]) -> Neighbours:
         """The visited states that speak for x [*batch, N, D]."""
-        return neighbours(x, self.states, self.mask, self.interpolate)
+        units = self.lengthscale.unsqueeze(-2)
+        return neighbours(x / units, self.states / units, self.mask, self.interpolate)
 
     def successor(self, x: Float[Tensor, "*#batch N D"]) -> Successor:
         """Where x [*batch, N, D] is expected to go: x' of its neighbours, corrected by their slopes."""
@@ -144,6 +191,8 @@ class Experience(nn.Module):
 
     def _local_slopes(self, states: Tensor, next_states: Tensor) -> Tensor:
         """J at every state: regression of the differences of x' on those of x, the nearest weighing most."""
+        units = self.lengthscale.unsqueeze(-2)
+        states, next_states = states / units, next_states / units
         everywhere = torch.ones(states.shape[:-1], dtype=torch.bool, device=states.device)
         near = neighbours(states, states, everywhere, min(self.slope_neighbours + 1, states.shape[-2]))
         reach = near.distance[..., -1:].clamp_min(COINCIDENT)
@@ -154,4 +203,4 @@ class Experience(nn.Module):
         eye = torch.eye(states.shape[-1], dtype=states.dtype, device=states.device)
         ridge = SLOPE_RIDGE * (weight.sum(-2) * reach.square()).unsqueeze(-1) * eye
         slope = torch.linalg.solve((weight * X).mT @ X + ridge, (weight * X).mT @ Y)
-        return slope.mT + eye
+        return (slope.mT + eye) * units.mT.unsqueeze(-3) / units.unsqueeze(-3)

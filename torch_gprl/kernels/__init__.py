@@ -7,6 +7,7 @@ from torch_gprl.kernels.gpytorch import GPyTorchKernel
 from torch_gprl.kernels.graph_geodesic import GeodesicKernel
 from torch_gprl.kernels.graph_nodes import GraphMatern, ShortestPathKernel
 from torch_gprl.kernels.graph_successor import SuccessorKernel
+from torch_gprl.kernels.graph_values import SuccessorWithRest
 from torch_gprl.kernels.linear import Linear
 from torch_gprl.kernels.parameters import Positive
 from torch_gprl.kernels.stationary import Matern, Periodic, RationalQuadratic, SquaredExponential
@@ -28,5 +29,6 @@ __all__ = [
     "ShortestPathKernel",
     "SquaredExponential",
     "SuccessorKernel",
+    "SuccessorWithRest",
     "Sum",
 ]

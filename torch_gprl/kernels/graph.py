@@ -30,24 +30,29 @@ REMEMBERED = 8  # inputs whose features are kept: a basis, and what one step com
 SMALLEST_REST = 1e-12  # of what the graph leaves open: a root of 0 has no derivative
 
 
-class Remembered(Generic[Found]):
-    """What was found for the last few inputs, and is worth keeping until what it was found from changes."""
+class Watch:
+    """Tells whether tensors have changed since they were last looked at."""
 
     def __init__(self) -> None:
-        self._sources: tuple[int, ...] = ()
+        self._seen: tuple[int, ...] = ()
+
+    def changed(self, tensors: Iterable[Tensor]) -> bool:
+        """Whether any has other numbers, or another place in memory, than at the last call."""
+        before, self._seen = self._seen, tuple(n for t in tensors for n in (t._version, t.data_ptr()))
+        return self._seen != before
+
+
+class Remembered(Generic[Found]):
+    """What was found for the last few inputs, worth keeping until the sources that tell it change."""
+
+    def __init__(self) -> None:
+        self._sources = Watch()
         self._kept: deque[tuple[Tensor, int, Found]] = deque(maxlen=REMEMBERED)
 
-    def renewed(self, sources: Iterable[Tensor]) -> bool:
-        """Whether the sources have changed since the last call; if so, all is forgotten."""
-        seen = tuple(number for t in sources for number in (t._version, t.data_ptr()))
-        if seen == self._sources:
-            return False
-        self._sources = seen
-        self._kept.clear()
-        return True
-
-    def find(self, x: Tensor, make: Callable[[Tensor], Found]) -> Found:
+    def find(self, x: Tensor, sources: Iterable[Tensor], make: Callable[[Tensor], Found]) -> Found:
         """What `make` says of x, or said of the same numbers before."""
+        if self._sources.changed(sources):
+            self._kept.clear()
         for old, version, found in self._kept:
             if version == old._version and (_same_memory(old, x) or torch.equal(old, x)):
                 return found
@@ -60,7 +65,7 @@ class TableKernel(Kernel):
     """A kernel F(x) F(z)ᵀ + … whose features need a table made from graph and parameters alone.
 
     The table is kept until one of these changes, and so are the features of the last few inputs, which one
-    step of a Gaussian process asks for several times. With gradients enabled all is made anew by each call.
+    step of a Gaussian process asks for several times. What needs a gradient is made anew by each call.
 
     Args:
         input_dim: number of input columns D.
@@ -70,6 +75,7 @@ class TableKernel(Kernel):
     def __init__(self, input_dim: int, batch_shape: Sequence[int] = ()) -> None:
         super().__init__(input_dim, batch_shape)
         self._table: Table = ()
+        self._table_sources = Watch()
         self._remembered: Remembered[Factors] = Remembered()
 
     @abstractmethod
@@ -80,16 +86,29 @@ class TableKernel(Kernel):
     def _build_features(self, x: Tensor, table: Table) -> Factors:
         """Two tensors [*batch, N, …] for each row of x [*batch, N, D]."""
 
+    def _sources_of_table(self) -> list[Tensor]:
+        """Parameters and buffers on which the table depends: all unless told."""
+        return [*self.parameters(), *self.buffers()]
+
     def features(self, x: Inputs) -> Factors:
         """What the covariance needs of x [*batch, N, D], see `_build_features`."""
         sources = [*self.parameters(), *self.buffers()]
         x = x.to(sources[0].dtype)
         if torch.is_grad_enabled() and (x.requires_grad or any(source.requires_grad for source in sources)):
-            return self._features_of_rows(x, self._build_table())
+            return self._features_of_rows(x, self._current_table())
         with torch.no_grad():
-            if self._remembered.renewed(sources):
+            return self._remembered.find(
+                x, sources, lambda x: self._features_of_rows(x, self._current_table())
+            )
+
+    def _current_table(self) -> Table:
+        sources = self._sources_of_table()
+        if torch.is_grad_enabled() and any(source.requires_grad for source in sources):
+            return self._build_table()
+        if self._table_sources.changed(sources):
+            with torch.no_grad():
                 self._table = self._build_table()
-            return self._remembered.find(x, lambda x: self._features_of_rows(x, self._table))
+        return self._table
 
     def _features_of_rows(self, x: Tensor, table: Table) -> Factors:
         """Features of x, whose leading dimensions beyond the kernel's batch are more rows of each learner."""

@@ -89,7 +89,8 @@ class GeodesicKernel(GraphKernel):
 
     def _geodesics(self, learner: int) -> Geodesics:
         visited, used = self.experience, slice(int(self.experience.size))
-        states = visited.states.reshape(-1, visited.capacity, self.input_dim)[learner, used]
+        states = visited.states / visited.lengthscale.unsqueeze(-2)
+        states = states.reshape(-1, visited.capacity, self.input_dim)[learner, used]
         after = visited.after_nodes.reshape(-1, visited.capacity, visited.interpolate)[learner, used, 0]
         goes_on = (~visited.ends.reshape(-1, visited.capacity)[learner, used]).nonzero().flatten()
         everywhere = torch.ones(states.shape[:-1], dtype=torch.bool, device=states.device)

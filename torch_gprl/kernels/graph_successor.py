@@ -102,6 +102,10 @@ class SuccessorKernel(TableKernel):
         features, rest = self.features(x)
         return self.outputscale.unsqueeze(-1) * (features.square().sum(-1) + rest.squeeze(-1).square())
 
+    def _sources_of_table(self) -> list[Tensor]:
+        """Amplitudes come after the table."""
+        return [self.log_lengthscale, *self.buffers()]
+
     def _build_table(self) -> Table:
         """Landmarks, the inverse of their factor, and Mφ of every vertex [*batch, C, L], all scaled."""
         visited = self.experience
@@ -148,8 +152,7 @@ class SuccessorKernel(TableKernel):
         """The expected way from x, found once while a fit tries many parameters."""
         if torch.is_grad_enabled() and x.requires_grad:
             return self._follow(x)
-        self._ways.renewed(self.experience.buffers())
-        return self._ways.find(x, self._follow)
+        return self._ways.find(x, self.experience.buffers(), self._follow)
 
     def _follow(self, x: Tensor) -> Way:
         batch = torch.broadcast_shapes(x.shape[:-2], self.batch_shape)

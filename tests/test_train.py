@@ -3,12 +3,14 @@
 import csv
 import dataclasses
 import importlib.util
+import os
 import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,18 +26,14 @@ ROOT = Path(__file__).parents[1]
 TINY = ["--learners", "2", "--num-envs", "2", "--budget", "20", "--evaluation-episodes", "2"]
 
 
-def start(*arguments: str) -> subprocess.Popen[str]:
-    command = [sys.executable, str(ROOT / "train.py"), *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
-
-
 @pytest.fixture(scope="module")
 def tiny_run(tmp_path_factory):
     """Two updates of two learners, as a user starts them: exit code, output, run folder."""
     folder = tmp_path_factory.mktemp("runs") / "tiny"
-    process = start("policy-gradient", *TINY, "--total-frames", "800", "--out", str(folder))
-    output, errors = process.communicate(timeout=300)
-    return SimpleNamespace(code=process.returncode, output=output, errors=errors, folder=folder)
+    command = [sys.executable, "train.py", "policy-gradient", *TINY]
+    command += ["--total-frames", "800", "--out", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
+    return SimpleNamespace(code=done.returncode, output=done.stdout, errors=done.stderr, folder=folder)
 
 
 def test_a_run_succeeds_and_says_what_it_reached_and_where_it_lies(tiny_run):
@@ -100,27 +98,53 @@ def test_the_checkpoint_holds_what_was_learned(tiny_run):
     assert (learner.updates, learner.frames) == (2, 800)
 
 
-def wait_for(condition, process: subprocess.Popen[str]) -> None:
-    deadline = time.monotonic() + 120
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+class Forked:
+    """The command line in a fork, which needs no new imports."""
+
+    def __init__(self, arguments: list[str], folder: Path) -> None:
+        self.output, self.errors = folder / "output", folder / "errors"
+        self.output.touch(), self.errors.touch()
+        self.pid = os.fork()
+        if not self.pid:
+            code = 70
+            try:
+                sys.stdout, sys.stderr = self.output.open("w"), self.errors.open("w", buffering=1)
+                os.dup2(sys.stderr.fileno(), 2)
+                code = train.main(arguments)
+                sys.stdout.flush(), sys.stderr.flush()
+            finally:
+                os._exit(code)
+
+    def interrupt(self) -> None:
+        os.kill(self.pid, signal.SIGINT)
+
+    def wait_for(self, condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 120
+        while not condition():
+            assert os.waitpid(self.pid, os.WNOHANG) == (0, 0), self.errors.read_text(encoding="utf-8")
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+    def end(self) -> tuple[int, str, str]:
+        """Exit code, output, errors."""
+        code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+        return code, self.output.read_text(encoding="utf-8"), self.errors.read_text(encoding="utf-8")
 
 
-def an_endless_run(folder: Path) -> subprocess.Popen[str]:
+def an_endless_run(folder: Path) -> Forked:
     """A run that has made its first update and would go on for days."""
-    process = start(*TINY, "--total-frames", "1000000000", "--out", str(folder))
-    metrics = folder / "metrics.csv"
-    wait_for(lambda: metrics.exists() and metrics.read_text(encoding="utf-8").count("\n") > 2, process)
-    return process
+    run = Forked([*TINY, "--total-frames", "1000000000", "--out", str(folder / "run")], folder)
+    metrics = folder / "run" / "metrics.csv"
+    run.wait_for(lambda: metrics.exists() and metrics.read_text(encoding="utf-8").count("\n") > 2)
+    return run
 
 
-def test_ctrl_c_keeps_what_was_learned(tmp_path):
-    process = an_endless_run(tmp_path / "run")
-    process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=120)
-    assert process.returncode == 0, errors
+def test_ctrl_c_keeps_what_was_learned(tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "LONGEST_FILM", 2)
+    run = an_endless_run(tmp_path)
+    run.interrupt()
+    code, output, errors = run.end()
+    assert code == 0, errors
     assert "finishing this update" in errors
     assert "stopped after" in output
     assert "final return" in output
@@ -129,14 +153,12 @@ def test_ctrl_c_keeps_what_was_learned(tmp_path):
 
 
 def test_ctrl_c_twice_aborts(tmp_path):
-    process = an_endless_run(tmp_path / "run")
-    process.send_signal(signal.SIGINT)
-    assert process.stderr is not None
-    while "finishing this update" not in (line := process.stderr.readline()):
-        assert line or process.poll() is None
-    process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=120)
-    assert process.returncode == 130
+    run = an_endless_run(tmp_path)
+    run.interrupt()
+    run.wait_for(lambda: "finishing this update" in run.errors.read_text(encoding="utf-8"))
+    run.interrupt()
+    code, output, errors = run.end()
+    assert code == 130
     assert errors.splitlines()[-1] == "train.py: aborted"
     assert "Traceback" not in errors
     assert "final return" not in output

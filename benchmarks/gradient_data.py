@@ -22,7 +22,7 @@ from torch_gprl.runs import evaluate
 
 EPISODES, STEPS = 5, 200  # of a batch
 TAIL = 150  # steps behind the cut that only pay: γ^150 is 1 % for γ = 0.97
-TRAINED_SIDE_BY_SIDE, TRAINING_ENVS, JUDGING_EPISODES = 4, 8, 50
+TRAINED_SIDE_BY_SIDE, TRAINING_ENVS, JUDGING_EPISODES = 4, 8, 20
 CENTRES = 100  # of the radial basis functions
 
 
@@ -50,8 +50,8 @@ class Setting:
 
 SETTINGS = (
     Setting("Pendulum-v1", "rbf", 48_000, {"mid": -925.0, "good": -260.0}),
-    Setting("cartpole-swingup", "mlp", 160_000),
-    Setting("atwood", "mlp", 160_000),
+    Setting("cartpole-swingup", "mlp", 80_000),
+    Setting("atwood", "mlp", 80_000),
 )
 
 

@@ -8,7 +8,8 @@ five environments, the deterministic policy plays the same starts, those of Gymn
 A learner has solved the task at the first of three evaluations in a row at -200 or above; a relapse is a
 later evaluation below.
 
-Every five learners leave a record in --out; a rerun skips what is there, and shows all in a table and a picture.
+Every five learners leave a record in --out; a rerun skips what is there, and shows all in a table and a
+picture.
 """
 
 import json

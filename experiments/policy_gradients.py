@@ -5,8 +5,9 @@
 
 Claim 1: Gaussian-process action values lower the variance of the gradient, hence speed up learning. The arms
 are ways to weigh the scores. Claim 2: one process kept across policy updates, pruned by information and age,
-beats one that is estimated anew at every update. The arms are weights of the age. Leaves the metrics of every
-arm, summary.json with the means over learners, and a picture.
+beats one that is estimated anew at every update. The arms are weights of the age, and a process that keeps
+its experience but solves it anew under each new policy. Metrics of every arm go to --out, where a later call
+finds them; the means over learners and a picture to --results.
 """
 
 import dataclasses
@@ -28,6 +29,8 @@ from torch_gprl.runs import MetricsWriter, bootstrap_interval, read_metrics, sav
 
 Metrics = dict[str, Float[np.ndarray, "updates L"]]
 
+# All experience solved at once, under today's policy.
+AT_ONCE = {"targets": "differences", "replay": 4_000, "noise": 0.001, "lengthscale": 0.5}
 # The arms that matter most come first.
 CLAIM_1: dict[str, dict[str, Any]] = {
     "REINFORCE": {"estimator": "return", "targets": "returns"},
@@ -36,7 +39,8 @@ CLAIM_1: dict[str, dict[str, Any]] = {
     "neural, generalised": {"estimator": "generalised", "trace": 0.8, "critic": "neural"},
     "GPTD, generalised": {"estimator": "generalised", "trace": 0.8, "targets": "differences"},
     "GPTD, all-action": {"estimator": "all-action", "targets": "differences"},
-    "GPTD, all-action, replay": {"estimator": "all-action", "targets": "differences", "replay": 3_000},
+    "GPTD, all-action, replay": {"estimator": "all-action", **AT_ONCE},
+    "the same, five steps": {"estimator": "all-action", "improvements": 4, "damping": 0.05, **AT_ONCE},
     "episodic natural": {"estimator": "return", "optimiser": "episodic-natural"},
     "(.7) as printed, k = 10": {"estimator": "k-step", "horizon": 10, "targets": "returns"},
     "k = 10 with baseline": {"estimator": "k-step-baseline", "horizon": 10, "targets": "returns"},
@@ -47,7 +51,7 @@ PERSISTENT = {"renew_every": 10**6, "targets": "differences", "budget": 100}
 CLAIM_2: dict[str, dict[str, Any]] = {
     "estimated anew": PERSISTENT | {"renew_every": 1},
     **{f"kept, λ = {weight}": PERSISTENT | {"age_weight": weight} for weight in (0.0, 0.5, 1.0)},
-    "kept, solved anew": PERSISTENT | {"replay": 5_000},
+    "kept, solved anew": PERSISTENT | AT_ONCE,
     **{f"kept, λ = {weight}": PERSISTENT | {"age_weight": weight} for weight in (0.25, 0.75)},
 }
 PANELS = {
@@ -70,7 +74,8 @@ class Options:
     frames: int = 60_000  # environment steps per learner
     seed: int = 0  # of all arms
     most_arms: int = 99  # to run now; those that have run are read, and a later call goes on
-    out: Path = Path("runs/policy-gradients")  # where results go
+    out: Path = Path("runs/policy-gradients")  # where metrics go
+    results: Path = Path("experiments/results")  # where figures and picture go
 
 
 def main(options: Options) -> None:
@@ -96,9 +101,11 @@ def main(options: Options) -> None:
         }
         for name, arm in curves.items()
     }
-    (folder / "summary.json").write_text(json.dumps(figures, indent=2, ensure_ascii=False) + "\n")
-    save_figure(draw(curves, options.task), folder / "curves.png")
-    print(f"everything is in {folder}")
+    options.results.mkdir(parents=True, exist_ok=True)
+    result = options.results / f"claim_{options.claim}_{options.task.replace('-', '_')}.json"
+    result.write_text(json.dumps(figures, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    save_figure(draw(curves, options.task), result.with_suffix(".png"))
+    print(f"metrics are in {folder}, figures in {result} beside their picture")
 
 
 def recorded(folder: Path, frames: int) -> Metrics | None:

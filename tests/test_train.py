@@ -28,9 +28,10 @@ TINY = ["--learners", "2", "--num-envs", "2", "--budget", "20", "--evaluation-ep
 
 @pytest.fixture(scope="module")
 def tiny_run(tmp_path_factory):
-    """Two updates of two learners, as a user starts them: exit code, output, run folder."""
+    """Two updates of two learners in a process of their own: exit code, output, run folder."""
     folder = tmp_path_factory.mktemp("runs") / "tiny"
-    command = [sys.executable, "train.py", "policy-gradient", *TINY]
+    short_film = "import sys, train; train.LONGEST_FILM = 20; sys.exit(train.main(sys.argv[1:]))"
+    command = [sys.executable, "-c", short_film, "policy-gradient", *TINY]
     command += ["--total-frames", "800", "--out", str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
     return SimpleNamespace(code=done.returncode, output=done.stdout, errors=done.stderr, folder=folder)

@@ -152,7 +152,8 @@ def draw(records: Sequence[dict[str, Any]]) -> Figure:
         axes.set(xlabel="environment steps per learner", ylabel="return, deterministic policy")
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25, linewidth=0.5)
-        axes.legend(frameon=False, fontsize="x-small", loc="lower right")
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(frameon=False, fontsize="x-small", loc="lower right")
     return figure
 
 

@@ -144,6 +144,13 @@ def test_exploring_hopes_for_more_than_exploiting_and_most_where_nobody_was():
     assert (hope[1] > hope[0]).all()
 
 
+def test_the_unknown_attracts_even_before_any_step_was_paid():
+    data = walk()
+    value = planned(data._replace(reward=torch.zeros_like(data.reward)))
+    right = torch.full((2, 1, 1), 2.3, dtype=torch.float64)  # visited up to 2.5
+    assert (value.best_action(right, explore=True) > 0.5).all()
+
+
 @pytest.mark.parametrize("learner", [0, 1])
 def test_learners_plan_apart(learner):
     data = walk()

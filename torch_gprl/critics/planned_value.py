@@ -17,19 +17,24 @@ that were seen, whose value is zero.
 The maximum is taken over averages of nearby actions, as if the hand trembled. Where many actions serve
 equally well, up to an edge beyond which none does, this keeps away from the edge.
 
+A new plan must stand a trial in imagination: only where it earns no less than the plan that is trusted, from
+states of the experience on, is it acted on when nothing is explored. Plans differ by their support, and one
+in several drops a pole that the last one held.
+
 A second value, for exploration, takes what the model does not know for better than all that was seen
 (optimism in the face of uncertainty): a share of each backup, as large as the doubt, is the highest hope.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torch_gprl.critics.maximise import candidate_actions
+from torch_gprl.critics.plan import Course, Seen, Support, take
 from torch_gprl.critics.transition_model import TransitionModel, Transitions
 from torch_gprl.gp import Posterior
 from torch_gprl.graphs import farthest_points
@@ -42,6 +47,7 @@ IMAGINED_STEPS = 2  # from a known state to an imagined one
 FIRST_SWEEPS = 3  # times as many as later: those begin from the last value
 MOST_ENDS = 50  # ends among the support
 NOWHERE = 1e6  # scaled coordinate of the places that a learner with fewer ends leaves empty
+TRIALS = 8  # states of the experience that plans are tried from
 CHUNK = 2**22  # numbers of the largest temporary: bounds the memory
 
 
@@ -60,36 +66,7 @@ class Planning:
     optimism: float = 1.0  # the unknown is hoped to hold the best seen, and so many attainable ranges more
     hold: int = 2  # environment steps that an action is held for
     smoothness: float = 0.5  # of values, as in Matérn kernels: 0.5, 1.5 or 2.5
-
-
-class _Support(NamedTuple):
-    """Where values are known, in standardised and scaled coordinates, and what they are."""
-
-    observation: Tensor  # [L, M, S] states, without the ends
-    scaled: Tensor  # [L, M + E, S] with the ends
-    ends: Tensor  # [L, E] 1 for an end, 0 for an empty place
-    loc: Tensor  # [L, 1, S] of the scaling
-    scale: Tensor  # [L, 1, S]
-    prior: Tensor  # [L, 1, 2] mean of the values where nothing is known
-    weights: Tensor  # [L, M + E, 2]
-
-
-class _Seen(NamedTuple):
-    """Visited states, their labels as ends, and what judges new ones."""
-
-    scaled: Tensor  # [L, R, S]
-    labels: Tensor  # [L, R]
-    label_weights: Tensor  # [L, R, 1]
-    novelty_factor: Tensor  # [L, R, R]
-
-
-class _Course(NamedTuple):
-    """Where an action leads that is held for some steps."""
-
-    observation: Tensor  # [L, N, S] in the end
-    reward: Tensor  # [L, N] in all, discounted
-    lasting: Tensor  # [L, N] the chance, 0 to 1, that the task goes on
-    doubt: Tensor  # [L, N] about the first step, as `Prediction`
+    trial: int = 100  # imagined steps in which a new plan must earn no less than the last; 0: no trial
 
 
 class PlannedValue:
@@ -113,7 +90,8 @@ class PlannedValue:
         self._centre, self._half = (low + high) / 2, (high - low) / 2
         self._backup_actions = self._candidates(low, high, planning.backup_actions)
         self.acting_actions = self._candidates(low, high, acting_actions)
-        self._support: _Support | None = None
+        self._support: Support | None = None  # of the last plan: it explores
+        self._trusted: Support | None = None  # of the best plan: it exploits
 
     def _candidates(self, low: Tensor, high: Tensor, count: int) -> Tensor:
         return (candidate_actions(low, high, count) - self._centre) / self._half
@@ -148,8 +126,35 @@ class PlannedValue:
         prior = torch.stack([average, self._hope], -1)
         none = torch.zeros_like(prior.expand(-1, scaled.shape[1], -1))
         loc, scale = self.model.loc, self.model.scale
-        self._support = _Support(observation, scaled, ends, loc, scale, prior, none)
+        self._support = Support(observation, scaled, ends, loc, scale, prior, none)
         self._iterate(values, self.planning.sweeps * (1 if before is not None else FIRST_SWEEPS))
+        self._trust(data)
+
+    def _trust(self, data: Transitions) -> None:
+        """Replace the trusted plan where the new one is no worse."""
+        new, old = self._support, self._trusted
+        assert new is not None
+        alike = old is not None and old.scaled.shape == new.scaled.shape  # the first end changes shapes
+        if old is None or not alike or not self.planning.trial:
+            self._trusted = new
+            return
+        steps = data.reward.shape[1]
+        spread = torch.linspace(0, steps - 1, min(TRIALS, steps), device=data.reward.device).long()
+        states = data.observation[:, spread]
+        self._trusted = take(
+            new, old, self._imagined_return(new, states) >= self._imagined_return(old, states)
+        )
+
+    def _imagined_return(self, support: Support, states: Float[Tensor, "L N S"]) -> Float[Tensor, " L"]:
+        """What a plan earns from these states on, all together, by the model."""
+        going, earned = torch.ones_like(states[..., 0]), torch.zeros_like(states[:, 0, 0])
+        for _ in range(self.planning.trial):
+            values = self._candidate_values(support, self._backup_actions, states, explore=False)
+            step = self.model.predict(states, self._backup_actions[values.argmax(-1)], doubt=False)
+            earned = earned + (going * step.reward).sum(1)
+            going = going * (self._end(step.observation) < 0.5)
+            states = step.observation
+        return earned
 
     def _kernels(self, like: Tensor) -> tuple[Kernel, Kernel]:
         """Of values and of novelty, in scaled coordinates, where the length scale of values is 1."""
@@ -174,7 +179,7 @@ class PlannedValue:
         factor = cholesky(kernels[0](scaled, scaled) + LABEL_NOISE * eye)
         weights = torch.cholesky_solve(labels.unsqueeze(-1), factor)
         novelty_factor = cholesky(kernels[1](scaled, scaled) + NOVELTY_NOISE * eye)
-        self._seen = _Seen(scaled, labels, weights, novelty_factor)
+        self._seen = Seen(scaled, labels, weights, novelty_factor)
         self._task_ends = bool(labels.any())
 
     def _end(self, observation: Tensor) -> Float[Tensor, "L N"]:
@@ -220,7 +225,8 @@ class PlannedValue:
         horizon = 1 - self.planning.discount
         self._low = torch.where(ends, low.clamp_max(0), low) / horizon
         self._high = torch.where(ends, high.clamp_min(0), high) / horizon
-        self._hope = self._high + self.planning.optimism * (self._high - self._low)
+        extent = torch.where(self._high > self._low, self._high - self._low, 1.0)  # 1: nothing was paid yet
+        self._hope = self._high + self.planning.optimism * extent
 
     def _iterate(self, values: Tensor, sweeps: int) -> None:
         """Value iteration at the support."""
@@ -249,7 +255,7 @@ class PlannedValue:
         """Discount of what comes after an action."""
         return self.planning.discount**self.planning.hold
 
-    def _course(self, observation: Tensor, action: Tensor, doubt: bool) -> _Course:
+    def _course(self, observation: Tensor, action: Tensor, doubt: bool) -> Course:
         """What holding actions leads to."""
         step = self.model.predict(observation, action, doubt)
         reward, lasting, unsure = step.reward, 1 - self._end(step.observation), step.doubt
@@ -257,7 +263,7 @@ class PlannedValue:
             step = self.model.predict(step.observation, action, doubt=False)
             reward = reward + self.planning.discount**held * lasting * step.reward
             lasting = lasting * (1 - self._end(step.observation))
-        return _Course(step.observation, reward, lasting, unsure)
+        return Course(step.observation, reward, lasting, unsure)
 
     def _trembling(self, actions: Float[Tensor, "J A"]) -> Float[Tensor, "J J"]:
         """Weights by which the value of an action is averaged over actions near it."""
@@ -273,7 +279,7 @@ class PlannedValue:
         )
         return torch.cat([values - support.prior, at_ends.expand(-1, support.ends.shape[1], -1)], 1)
 
-    def _unknown(self, course: _Course) -> Float[Tensor, "L N 2"]:
+    def _unknown(self, course: Course) -> Float[Tensor, "L N 2"]:
         """Share of a backup that is not known, for both values; zero for the one that exploits."""
         new = torch.maximum(course.doubt, self._novelty(course.observation) * course.lasting)
         return torch.stack([torch.zeros_like(new), new], -1)
@@ -282,7 +288,7 @@ class PlannedValue:
         """Lowest and highest of both values."""
         return self._low.unsqueeze(-1), torch.stack([self._high, self._hope], -1)
 
-    def _values_of(self, support: _Support, observation: Tensor) -> Float[Tensor, "L N 2"]:
+    def _values_of(self, support: Support, observation: Tensor) -> Float[Tensor, "L N 2"]:
         unit = self.planning.lengthscale * math.sqrt(observation.shape[-1])
         scaled = (observation - support.loc) / (support.scale * unit)
         values = self._kernel(scaled, support.scaled) @ support.weights + support.prior
@@ -295,9 +301,16 @@ class PlannedValue:
         self, observation: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"], explore: bool
     ) -> Float[Tensor, "L N"]:
         """r̂ + γ V(ŝ') of actions in halves of the actuator's range, each held for `Planning.hold` steps."""
-        assert self._support is not None
+        return self._action_values(self._acted_on(explore), observation, action, explore)
+
+    def _acted_on(self, explore: bool) -> Support:
+        support = self._support if explore else self._trusted
+        assert support is not None
+        return support
+
+    def _action_values(self, support: Support, observation: Tensor, action: Tensor, explore: bool) -> Tensor:
         course = self._course(observation, action, doubt=explore)
-        after = self._values_of(self._support, course.observation)[..., EXPLORE if explore else EXPLOIT]
+        after = self._values_of(support, course.observation)[..., EXPLORE if explore else EXPLOIT]
         value = course.reward + self._beyond * course.lasting * after
         if not explore:
             return value
@@ -310,13 +323,18 @@ class PlannedValue:
     @torch.no_grad()
     def candidate_values(self, observation: Float[Tensor, "L N S"], explore: bool) -> Float[Tensor, "L N J"]:
         """The values of all candidate actions, each averaged over actions near it."""
-        actions, trembling = self.acting_actions, self._trembling(self.acting_actions)
+        return self._candidate_values(self._acted_on(explore), self.acting_actions, observation, explore)
+
+    def _candidate_values(
+        self, support: Support, actions: Tensor, observation: Tensor, explore: bool
+    ) -> Float[Tensor, "L N J"]:
+        trembling = self._trembling(actions)
         each = len(observation) * len(actions) * (self.model.budget + self.planning.support)
         values = []
         for some in observation.split(max(1, CHUNK // each), 1):
             spread = some.repeat_interleave(len(actions), 1)
             tried = actions.repeat(some.shape[1], 1).expand(len(some), -1, -1)
-            value = self.action_values(spread, tried, explore)
+            value = self._action_values(support, spread, tried, explore)
             values.append(value.unflatten(1, (some.shape[1], -1)) @ trembling.mT)
         return torch.cat(values, 1)
 
@@ -344,18 +362,19 @@ class PlannedValue:
 
     def basis_points(self, learner: int) -> Float[Tensor, "M S"]:
         """The support states of a learner, as observations."""
-        assert self._support is not None
-        return self._support.observation[learner]
+        return self._acted_on(explore=False).observation[learner]
 
     # ---------------------------------------------------------------- keeping
 
     def state_dict(self) -> dict[str, Any]:
         """The plan; what judges states follows from the experience that was planned on."""
-        return {} if self._support is None else self._support._asdict()
+        if self._support is None or self._trusted is None:
+            return {}
+        return {"last": self._support._asdict(), "trusted": self._trusted._asdict()}
 
     def load_state_dict(self, state: dict[str, Any], data: Transitions) -> None:
         """Take up what `state_dict` gave, with the experience that was planned on."""
         if state:
             self._judge(data, self._kernels(data.observation))
             self._bound(data)
-            self._support = _Support(**state)
+            self._support, self._trusted = Support(**state["last"]), Support(**state["trusted"])

@@ -152,8 +152,8 @@ def draw_curves(setting: Setting, outcomes: dict[str, Outcome], path: Path) -> N
 
 def draw_visits(setting: Setting, outcomes: dict[str, Outcome], path: Path) -> None:
     """How often each cell of the plane was visited, by arm."""
-    columns = 4
-    rows = -(-len(outcomes) // columns)
+    rows = -(-len(outcomes) // 4)
+    columns = -(-len(outcomes) // rows)
     figure = Figure(figsize=(3 * columns, 2.6 * rows), layout="constrained")
     panels = np.ravel(figure.subplots(rows, columns))
     for axes in panels[len(outcomes) :]:

@@ -33,6 +33,7 @@ TUNING_NODES = 100
 TUNING_POINTS = 300
 HELD_OUT = 2  # one trajectory in so many is held out of the graph while its kernel is tuned
 NEIGHBOURS = 4
+MEMORY = 800  # basis vectors of a Euclidean kernel that remembers about as much as a graph of visited states
 PRINTED_THRESHOLD = 0.7
 LOOKAHEAD = 20  # steps
 
@@ -46,6 +47,7 @@ class Arm:
     graph: Callable[[int, int], Graph]  # from input columns and the number of transitions that will be stored
     kernel: Callable[[Graph, int], Kernel]  # from the graph and input columns
     suited: bool = True  # units of visited states by an ordinary kernel; else those of the inputs
+    budgets: tuple[int, ...] = ()  # basis vectors, if not those of all
 
 
 def _nodes(dims: int, transitions: int) -> TransitionGraph:
@@ -81,6 +83,7 @@ EUCLIDEAN = {
     "Matérn 1/2": Arm(_none, lambda graph, dims: Matern(dims, smoothness=0.5)),
     "Matérn 3/2": Arm(_none, lambda graph, dims: Matern(dims)),
 }
+REMEMBERS = Arm(_none, lambda graph, dims: Matern(dims, smoothness=0.5), budgets=(MEMORY,))
 ON_GRAPHS = {
     "shortest path, nearest (.20)": _on_nodes(lambda graph: ShortestPathKernel(graph)),
     "shortest path, interpolated (.21)": _on_nodes(
@@ -97,7 +100,7 @@ ON_GRAPHS = {
     ),
     "successor": _on_experience(lambda visited: SuccessorWithRest(visited, DISCOUNT)),
 }
-ARMS = EUCLIDEAN | ON_GRAPHS
+ARMS = EUCLIDEAN | ON_GRAPHS | {f"Matérn 1/2, {MEMORY} kept": REMEMBERS}
 
 
 class Tuned:

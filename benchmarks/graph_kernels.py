@@ -32,15 +32,13 @@ from torch_gprl.graphs.edges import EdgeRule
 
 TARGET_NOISE = 0.1  # standard deviation on targets, in those of the value
 MODEL_ERROR = 1e-3  # variance that every predictive density has at least, in squared deviations of the value
-MEMORY = 800  # basis vectors of the Euclidean kernel that remembers as much as a graph of visited states
-REMEMBERS = "Matérn 1/2"
 PRINTED = {".20 as printed": ".20", ".21 as printed": ".21"}
 NOISY_TORQUE = 0.7  # N m
 THRESHOLDS = (0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4)  # of equation (.18)
 PROBLEMS: tuple[System, ...] = (
     Jump(),
     Spiral(),
-    Jump(NOISY_TORQUE, 40),
+    Jump(NOISY_TORQUE, roll_outs=12),
     Jump(before=Jump(catch_angle=0.6)),
     CartPole(),
     Atwood(),
@@ -149,7 +147,7 @@ def learn(kernel: str, truth: Truth, seen: Trajectories, seed: int, options: Opt
             yield Learned(kernel, budget, posterior, 0.0, time.perf_counter() - start, 0.0)
         return
     tuned = Tuned(ARMS[kernel], seen, seed, options.tuning_steps, noise)
-    for group in tuned.together((*budgets, MEMORY) if kernel == REMEMBERS else budgets):
+    for group in tuned.together(ARMS[kernel].budgets or budgets):
         start = time.perf_counter()
         learned = tuned.learn(group, seed)
         middle = time.perf_counter()
@@ -190,9 +188,7 @@ def draw(problems: list[System], options: Options) -> None:
         if problem.axes and not problem.action_values:
             surfaces: dict[str, Tensor] = {}
             for kernel in options.kernels or (*ARMS, *PRINTED):
-                for learned in learn(kernel, truth, seen, 0, options):
-                    kept = f"{kernel}, {MEMORY} kept" if learned.budget == MEMORY else kernel
-                    surfaces[kept] = learned.posterior.mean
+                surfaces[kernel] = [*learn(kernel, truth, seen, 0, options)][-1].posterior.mean
             draw_surfaces(problem, truth, surfaces, options.out / f"surfaces_{problem.file_name}.png")
             draw_graph(problem, truth, seen, options.out / f"graph_{problem.file_name}.png")
     draw_connectivity(graphs, options.out / "connectivity.png")

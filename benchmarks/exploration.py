@@ -23,7 +23,7 @@ from rich.progress import Progress
 from rich.table import Table
 from scipy.stats import wilcoxon
 
-from benchmarks.exploration_arms import ARMS, BY_VALUES, GAUSSIAN, MATCHED, SETTINGS, Outcome, Setting, run
+from benchmarks.exploration_arms import ARMS, GAUSSIAN, MATCHED, SETTINGS, Outcome, Setting, run
 from benchmarks.exploration_pictures import Snapshots, draw
 
 SHOWN = ("steps to threshold", "steps to discovery", "final return", "time in goal", "entropy of cells")
@@ -36,7 +36,7 @@ class Options:
     """What to compare."""
 
     learner: Literal["q-learning", "dynamic-programming"] = "dynamic-programming"  # what all arms share
-    tasks: tuple[str, ...] = tuple(BY_VALUES)
+    tasks: tuple[str, ...] = ()  # all of the learner's unless named
     arms: tuple[str, ...] = ()  # all of the learner's unless named
     learners: int = 20  # paired seeds
     quick: bool = False  # a fifth of the steps, four learners: shows that it works, not who wins
@@ -54,7 +54,7 @@ def main(options: Options) -> None:
     if options.quick:
         options = dataclasses.replace(options, learners=QUICK_LEARNERS, out=options.out / "quick")
     options.out.mkdir(parents=True, exist_ok=True)
-    for task in options.tasks:
+    for task in options.tasks or settings:
         setting = settings[task]
         with Progress() as progress:
             for arm in options.arms or arms:
@@ -64,7 +64,7 @@ def main(options: Options) -> None:
 
 def record_of(setting: Setting, arm: str, first: int, out: Path) -> Path:
     """Where a finished group of learners is kept, by its first one."""
-    return out / f"{setting.learner} {setting.task} {arm} {first}.pt"
+    return out / f"{setting.learner} {setting.name} {arm} {first}.pt"
 
 
 def complete(setting: Setting, arm: str, options: Options, progress: Progress) -> None:
@@ -81,7 +81,7 @@ def complete(setting: Setting, arm: str, options: Options, progress: Progress) -
         if path.exists():
             continue
         learners = range(first, min(first + GROUP, options.learners))
-        bar = progress.add_task(f"{setting.task}, {arm}, learner {first} and on", total=frames)
+        bar = progress.add_task(f"{setting.name}, {arm}, learner {first} and on", total=frames)
         pictures = Snapshots(setting)
         for learner, outcome in run(setting, numbers, learners, frames):
             progress.update(bar, completed=learner.frames)
@@ -112,7 +112,7 @@ def matching_std(setting: Setting, sigma: float, out: Path) -> float:
 def load(setting: Setting, arm: str, out: Path) -> tuple[Outcome, dict[str, Any]] | None:
     """What the finished groups of an arm did, and the pictures of the first; none if there is no group."""
     paths = sorted(
-        out.glob(f"{setting.learner} {setting.task} {arm} [0-9]*.pt"),
+        out.glob(f"{setting.learner} {setting.name} {arm} [0-9]*.pt"),
         key=lambda path: int(path.stem.split()[-1]),
     )
     groups = [torch.load(path, weights_only=True) for path in paths]
@@ -134,7 +134,7 @@ def report(setting: Setting, out: Path) -> None:
     _show(setting, found, tuned)
     path = out / "exploration.json"
     everything = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    everything.setdefault(setting.learner, {})[setting.task] = {"tuned": tuned, "arms": found}
+    everything.setdefault(setting.learner, {})[setting.name] = {"tuned": tuned, "arms": found}
     path.write_text(json.dumps(everything, indent=2) + "\n", encoding="utf-8")
     draw(
         setting,
@@ -171,7 +171,7 @@ def _paired(values: torch.Tensor, baseline: torch.Tensor) -> float:
 
 
 def _show(setting: Setting, found: dict[str, dict[str, Any]], tuned: str | None) -> None:
-    table = Table(title=f"{setting.learner} on {setting.task}: means (p against {tuned}, paired)")
+    table = Table(title=f"{setting.learner} on {setting.name}: means (p against {tuned}, paired)")
     table.add_column("arm")
     for name in SHOWN:
         table.add_column(name)

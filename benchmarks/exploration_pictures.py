@@ -120,10 +120,10 @@ def draw(
     setting: Setting, outcomes: dict[str, Outcome], pictures: dict[str, dict[str, Any]], out: Path
 ) -> None:
     """All pictures of a task, as far as arms are done."""
-    draw_curves(setting, outcomes, out / f"{setting.learner}-{setting.task}-curves.png")
-    draw_visits(setting, outcomes, out / f"{setting.learner}-{setting.task}-visits.png")
+    draw_curves(setting, outcomes, out / f"{setting.learner}-{setting.name}-curves.png")
+    draw_visits(setting, outcomes, out / f"{setting.learner}-{setting.name}-visits.png")
     for arm, taken in pictures.items():
-        name = f"{setting.learner}-{setting.task}-{arm.replace(' ', '-')}"
+        name = f"{setting.learner}-{setting.name}-{arm.replace(' ', '-')}"
         if "sigma" in taken:
             draw_sigma(setting, taken, out / f"{name}-sigma.png")
         if "figure 2" in taken:
@@ -143,7 +143,7 @@ def draw_curves(setting: Setting, outcomes: dict[str, Outcome], path: Path) -> N
     returns.set(
         xlabel="environment steps",
         ylabel="return of the greedy policy",
-        title=f"{setting.learner} on {setting.task}",
+        title=f"{setting.learner} on {setting.name}",
     )
     sigma.set(xlabel="environment steps", ylabel="distance to the greedy action\n(halves of the range, rms)")
     returns.legend(fontsize="x-small")

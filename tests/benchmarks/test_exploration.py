@@ -68,6 +68,11 @@ def test_every_task_has_its_plane(task):
     assert found.states.shape == (2, 25, 2)
 
 
+def test_rounded_rewards_are_multiples_of_their_resolution():
+    ((_, found),) = run(BY_PLANS["pendulum-explore-rounded"], {}, range(2), 25)
+    assert torch.equal(found.reward, torch.zeros(2, 25))  # it hangs, where the task pays about 1e-9
+
+
 @pytest.mark.parametrize(("setting", "other"), [(SETTING, "upper"), (BY_PLANS["pendulum-explore"], "gibbs")])
 def test_arms_start_alike(setting, other):
     first, second = (

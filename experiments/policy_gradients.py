@@ -50,9 +50,10 @@ CLAIM_1: dict[str, dict[str, Any]] = {
 PERSISTENT = {"renew_every": 10**6, "targets": "differences", "budget": 100}
 CLAIM_2: dict[str, dict[str, Any]] = {
     "estimated anew": PERSISTENT | {"renew_every": 1},
-    **{f"kept, λ = {weight}": PERSISTENT | {"age_weight": weight} for weight in (0.0, 0.5, 1.0)},
+    "kept, λ = 0.0": PERSISTENT,
     "kept, solved anew": PERSISTENT | AT_ONCE,
-    **{f"kept, λ = {weight}": PERSISTENT | {"age_weight": weight} for weight in (0.25, 0.75)},
+    "newest rollout, solved at once": PERSISTENT | AT_ONCE | {"replay": 1_000},
+    **{f"kept, λ = {weight}": PERSISTENT | {"age_weight": weight} for weight in (0.5, 1.0, 0.25, 0.75)},
 }
 PANELS = {
     "return": "return per episode",
@@ -91,11 +92,11 @@ def main(options: Options) -> None:
             continue
         left -= metrics is None
         curves[name] = run(options, numbers, place) if metrics is None else metrics
-        value, low, high = summary(curves[name]["return"])
+        value, low, high = summary(curves[name]["return"], "return")
         print(f"{name:26s} return of the last tenth {value:8.1f} [{low:.1f}, {high:.1f}]", flush=True)
     figures = {
         name: {
-            key: dict(zip(("mean", "low", "high"), summary(arm[key]), strict=True))
+            key: dict(zip(("mean", "low", "high"), summary(arm[key], key), strict=True))
             for key in PANELS
             if key in arm
         }
@@ -133,9 +134,10 @@ def run(options: Options, numbers: dict[str, Any], folder: Path) -> Metrics:
     return read_metrics(folder / "metrics.csv")
 
 
-def summary(metric: Float[np.ndarray, "updates L"]) -> tuple[float, float, float]:
-    """Mean over learners of the last tenth of a run, with its 95 % interval."""
-    last = metric[-max(1, len(metric) // 10) :].mean(axis=0)
+def summary(metric: Float[np.ndarray, "updates L"], key: str) -> tuple[float, float, float]:
+    """Mean over learners of the return at the end, and of other metrics in the second half; 95 % interval."""
+    share = 10 if key == "return" else 2
+    last = metric[-max(1, len(metric) // share) :].mean(axis=0)
     low, high = bootstrap_interval(last)
     return float(last.mean()), float(low), float(high)
 

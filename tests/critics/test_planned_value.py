@@ -163,3 +163,26 @@ def test_learners_plan_apart(learner):
     value.plan(alone, uniform[learner : learner + 1])
     own = value.best_action(grid()[:1], explore=False)[0]
     torch.testing.assert_close(own, together, rtol=0, atol=0.06)  # ties between neighbours may fall apart
+
+
+@pytest.mark.parametrize(("trial", "kept"), [(30, True), (0, False)])
+def test_a_plan_that_earns_less_in_imagination_is_not_trusted(trial, kept):
+    data = walk()
+    value = planned(data, discount=0.9, sweeps=1, hold=1, trial=trial)
+    before = value.best_action(grid(), explore=False)
+    state = value.state_dict()
+    state["last"]["weights"] = -5 * state["last"]["weights"]  # the next plan begins with the opposite
+    value.load_state_dict(state, data)
+    value.plan(data, torch.zeros(2, 0, 1 + IMAGINED_STEPS, dtype=torch.float64))
+    assert torch.equal(value.best_action(grid(), explore=False), before) == kept
+
+
+def test_a_plan_that_earns_more_in_imagination_takes_over():
+    data = walk()
+    value = planned(data, discount=0.9)
+    before = value.best_action(grid(), explore=False)
+    state = value.state_dict()
+    state["trusted"]["weights"] = -5 * state["trusted"]["weights"]
+    value.load_state_dict(state, data)
+    value.plan(data, torch.zeros(2, 0, 1 + IMAGINED_STEPS, dtype=torch.float64))
+    torch.testing.assert_close(value.best_action(grid(), explore=False), before, rtol=0, atol=0.3)

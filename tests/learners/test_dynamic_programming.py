@@ -10,7 +10,14 @@ from torch_gprl.learners import DynamicProgramming, DynamicProgrammingConfig
 from torch_gprl.runs import evaluate
 
 SMALL = DynamicProgrammingConfig(
-    total_frames=125, model_budget=50, support=50, imagined=50, sweeps=5, backup_actions=5, acting_actions=9
+    total_frames=125,
+    model_budget=50,
+    support=50,
+    imagined=50,
+    sweeps=5,
+    backup_actions=5,
+    acting_actions=9,
+    trial=5,
 )
 
 

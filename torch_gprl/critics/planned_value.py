@@ -18,8 +18,8 @@ The maximum is taken over averages of nearby actions, as if the hand trembled. W
 equally well, up to an edge beyond which none does, this keeps away from the edge.
 
 A new plan must stand a trial in imagination: only where it earns no less than the plan that is trusted, from
-states of the experience on, is it acted on when nothing is explored. Plans differ by their support, and one
-in several drops a pole that the last one held.
+states of the experience on and with the value of where it gets to, is it acted on when nothing is explored.
+Plans differ by their support, and one in several drops a pole that the last one held.
 
 A second value, for exploration, takes what the model does not know for better than all that was seen
 (optimism in the face of uncertainty): a share of each backup, as large as the doubt, is the highest hope.
@@ -47,7 +47,7 @@ IMAGINED_STEPS = 2  # from a known state to an imagined one
 FIRST_SWEEPS = 3  # times as many as later: those begin from the last value
 MOST_ENDS = 50  # ends among the support
 NOWHERE = 1e6  # scaled coordinate of the places that a learner with fewer ends leaves empty
-TRIALS = 8  # states of the experience that plans are tried from
+TRIALS = 6  # states of the experience that plans are tried from
 CHUNK = 2**22  # numbers of the largest temporary: bounds the memory
 
 
@@ -66,7 +66,7 @@ class Planning:
     optimism: float = 1.0  # the unknown is hoped to hold the best seen, and so many attainable ranges more
     hold: int = 2  # environment steps that an action is held for
     smoothness: float = 0.5  # of values, as in Matérn kernels: 0.5, 1.5 or 2.5
-    trial: int = 100  # imagined steps in which a new plan must earn no less than the last; 0: no trial
+    trial: int = 60  # imagined steps in which a new plan must earn no less than the last; 0: no trial
 
 
 class PlannedValue:
@@ -141,20 +141,19 @@ class PlannedValue:
         steps = data.reward.shape[1]
         spread = torch.linspace(0, steps - 1, min(TRIALS, steps), device=data.reward.device).long()
         states = data.observation[:, spread]
-        self._trusted = take(
-            new, old, self._imagined_return(new, states) >= self._imagined_return(old, states)
-        )
+        self._trusted = take(new, old, self._tried(new, states) >= self._tried(old, states))
 
-    def _imagined_return(self, support: Support, states: Float[Tensor, "L N S"]) -> Float[Tensor, " L"]:
-        """What a plan earns from these states on, all together, by the model."""
+    def _tried(self, plan: Support, states: Float[Tensor, "L N S"]) -> Float[Tensor, " L"]:
+        """What a plan earns from these states on by the model, with the last plan's value of the end."""
+        assert self._support is not None
         going, earned = torch.ones_like(states[..., 0]), torch.zeros_like(states[:, 0, 0])
         for _ in range(self.planning.trial):
-            values = self._candidate_values(support, self._backup_actions, states, explore=False)
+            values = self._candidate_values(plan, self._backup_actions, states, explore=False)
             step = self.model.predict(states, self._backup_actions[values.argmax(-1)], doubt=False)
             earned = earned + (going * step.reward).sum(1)
             going = going * (self._end(step.observation) < 0.5)
             states = step.observation
-        return earned
+        return earned + (going * self._values_of(self._support, states)[..., EXPLOIT]).sum(1)
 
     def _kernels(self, like: Tensor) -> tuple[Kernel, Kernel]:
         """Of values and of novelty, in scaled coordinates, where the length scale of values is 1."""

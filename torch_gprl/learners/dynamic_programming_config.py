@@ -17,6 +17,7 @@ LEAST = {
     "backup_actions": 3,
     "acting_actions": 3,
     "hold": 1,
+    "trial": 0,
     "optimism": 0,
     "growth": 0,
 }
@@ -44,6 +45,7 @@ class DynamicProgrammingConfig(PlannedBehaviour):
     tremble: float = 0.25  # standard deviation of actions to plan for, in halves of the actuator's range
     hold: int = 2  # environment steps that a plan holds an action for; acting chooses anew at every step
     smoothness: float = 0.5  # of values, as in Matérn kernels: 0.5, 1.5 or 2.5
+    trial: int = 60  # imagined steps in which a new plan must earn no less than the last; 0: no trial
 
     optimism: float = 1.0  # exploring hopes for the best seen and so many ranges of value more
 
@@ -71,4 +73,5 @@ class DynamicProgrammingConfig(PlannedBehaviour):
             self.optimism,
             self.hold,
             self.smoothness,
+            self.trial,
         )

@@ -12,6 +12,8 @@ from torchrl.envs import EnvBase
 from torch_gprl.learners import (
     ActorCritic,
     ActorCriticConfig,
+    DynamicProgramming,
+    DynamicProgrammingConfig,
     PolicyGradient,
     PolicyGradientConfig,
     QLearning,
@@ -96,12 +98,19 @@ def actor_critic(env: EnvBase, steps: int, **options: Any) -> ActorCritic:
     return ActorCritic(env, config)
 
 
+def dynamic_programming(env: EnvBase, steps: int) -> DynamicProgramming:
+    sizes = {"model_budget": 15, "support": 10, "imagined": 10, "sweeps": 3, "first_steps": max(3 * steps, 2)}
+    config = DynamicProgrammingConfig(total_frames=3 * 3 * steps, rollout_steps=steps, **sizes)
+    return DynamicProgramming(env, config)
+
+
 LEARNERS = {
     "policy gradient": policy_gradient,
     "policy gradient, differences": lambda *given: policy_gradient(*given, targets="differences"),
     "q-learning": q_learning,
     "q-learning, online": lambda *given: q_learning(*given, targets="online"),
     "actor-critic": actor_critic,
+    "dynamic programming": dynamic_programming,
 }
 
 
@@ -119,7 +128,7 @@ def test_a_learner_goes_on(oddity: str, learner: str):
     assert len(updates) == made.total_updates
     assert made.frames >= made.config.total_frames
     numbers = [*made.policy.parameters(), *made.critic.state_dict().values()]
-    assert all(tensor.isfinite().all() for tensor in numbers)
+    assert all(number.isfinite().all() for number in numbers if isinstance(number, Tensor))
     state = Odd(odd).reset()
     action = made.policy(state)["action"]
     assert action.isfinite().all()

@@ -151,6 +151,14 @@ def test_the_unknown_attracts_even_before_any_step_was_paid():
     assert (value.best_action(right, explore=True) > 0.5).all()
 
 
+def test_a_prize_that_an_end_pays_is_hoped_for_once():
+    data = walk(end=1.0)
+    value = planned(data._replace(reward=100 * data.terminated), optimism=1.0)
+    far = torch.full((2, 1, 1), -9.0, dtype=torch.float64)
+    hope = value.action_values(far, torch.zeros_like(far), explore=True)
+    assert ((hope > 150) & (hope <= 200 + 1e-9)).all()  # the prize, and its distance from nothing more
+
+
 @pytest.mark.parametrize("learner", [0, 1])
 def test_learners_plan_apart(learner):
     data = walk()

@@ -218,12 +218,14 @@ class PlannedValue:
         return torch.cat([scaled, where], 1), ends
 
     def _bound(self, data: Transitions) -> None:
-        """The attainable range of values [L, 1]: rewards for ever, or until an end."""
-        low, high = data.reward.amin(1, keepdim=True), data.reward.amax(1, keepdim=True)
-        ends = data.terminated.any(1, keepdim=True)
-        horizon = 1 - self.planning.discount
-        self._low = torch.where(ends, low.clamp_max(0), low) / horizon
-        self._high = torch.where(ends, high.clamp_min(0), high) / horizon
+        """The attainable range of values [L, 1]."""
+        ended, horizon = data.terminated > 0.5, 1 - self.planning.discount
+        # V is a mean of what is paid for ever and of what an end pays once
+        for_ever = torch.where(ended, torch.nan, data.reward / horizon)
+        once, nothing = (torch.where(ended, paid, torch.nan) for paid in (data.reward, 0.0))
+        values = torch.cat([for_ever, once, nothing], 1)
+        self._low = values.nan_to_num(torch.inf).amin(1, keepdim=True)
+        self._high = values.nan_to_num(-torch.inf).amax(1, keepdim=True)
         extent = torch.where(self._high > self._low, self._high - self._low, 1.0)  # 1: nothing was paid yet
         self._hope = self._high + self.planning.optimism * extent
 

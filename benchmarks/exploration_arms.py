@@ -131,7 +131,7 @@ BY_VALUES = {
 
 def _by_plans(task: str, frames: int, every: int) -> Setting:
     """The same task for dynamic programming, which needs fewer steps but more time for each."""
-    numbers = {"growth": 0.1, "hold": 1}  # plans half as often as by default, and less far
+    numbers = {"growth": 0.1, "hold": 1, "trial": 0}  # simpler plans than by default, and half as many
     return dataclasses.replace(
         BY_VALUES[task], learner="dynamic-programming", numbers=numbers, frames=frames, every=every
     )

@@ -82,8 +82,8 @@ def test_numbers_out_of_range_are_named(field, value):
 
 
 @pytest.mark.slow
-def test_the_pendulum_swings_up_after_six_hundred_steps():
-    learner = make(learners=10, config=DynamicProgrammingConfig(total_frames=600), task="Pendulum-v1")
+def test_the_pendulum_swings_up_after_four_hundred_steps():
+    learner = make(learners=10, config=DynamicProgrammingConfig(total_frames=400), task="Pendulum-v1")
     for _ in learner.train():
         pass
     starts = envs.make("Pendulum-v1", learners=10, num_envs=20, seed=1000)

@@ -60,13 +60,16 @@ SMALL = "--workers 2 --learners 2 --num-envs 2 --logger csv --budget 15 --rollou
 
 
 def begun(folder: Path, updates: int, options: str) -> subprocess.Popen[str]:
-    """A run that has made so many updates, and goes on."""
+    """A run that has made so many updates and a checkpoint, and goes on."""
     command = [sys.executable, "train.py", *options.split(), *SMALL.split(), "--out", str(folder)]
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=ALONE, start_new_session=True
     )
     metrics, deadline = folder / "metrics.csv", time.monotonic() + 200
-    while not (metrics.exists() and metrics.read_text(encoding="utf-8").count("\n") > 2 * updates):
+    while not (
+        any(folder.glob("checkpoints/checkpoint-*"))
+        and metrics.read_text(encoding="utf-8").count("\n") > 2 * updates
+    ):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.01)

@@ -14,6 +14,7 @@ import signal
 import tempfile
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ from torchrl.weight_update import NoWeightSyncScheme
 from torch_gprl.learners.board import Board, FollowingPolicy
 from torch_gprl.learners.collecting import watched
 from torch_gprl.learners.worker_state import ResumableCollector, packed, streams_of, unpacked
+
+LAST_BREATH = 2.0  # s between the moment when a worker's pipe breaks and its end
 
 
 class WorkerCollection:
@@ -135,6 +138,8 @@ class WorkerCollection:
         if reports:
             return "; ".join(f"{path.stem}: {path.read_text(encoding='utf-8')}" for path in reports)
         processes = [] if self._collector is None else self._collector.procs
+        with contextlib.suppress(ValueError):  # of closed processes
+            wait([process.sentinel for process in processes], timeout=LAST_BREATH)
         codes = enumerate(map(_exit_code, processes))
         return "; ".join(f"worker-{i} ended with exit code {code}" for i, code in codes if code)
 

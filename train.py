@@ -104,7 +104,7 @@ ALL_ACTION_REPLAY: dict[str, object] = {
     "estimator": "all-action",
     "targets": "differences",
     "exploration": "fixed",
-    "replay": 4_000,
+    "replay": 13_000,
     "improvements": 10,
     "damping": 0.05,
     "noise": 0.001,

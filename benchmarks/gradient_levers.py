@@ -4,9 +4,9 @@
     python -m benchmarks.gradient_levers --levers "as preset" --frames 13000 --episodes 100
 
 The preset of `train.py` for this task, and the same with one number changed. After every batch, 40 steps of
-five environments, the deterministic policy plays the same starts, those of Gymnasium's seeds 1000, 1001, ...
-A learner has solved the task at the first of three evaluations in a row at -200 or above; a relapse is a
-later evaluation below.
+five environments (later every fifth), the deterministic policy plays the same starts, those of Gymnasium's
+seeds 1000, 1001, ... A learner has solved the task at the first of three evaluations in a row at -200 or
+above; a relapse is a later evaluation below.
 
 Every five learners leave a record in --out; a rerun skips what is there, and shows all in a table and a
 picture.
@@ -33,6 +33,7 @@ from train import POLICY_GRADIENT_PRESETS
 
 TASK, THRESHOLD = "Pendulum-v1", -200.0
 SIDE_BY_SIDE = 5  # learners of one record
+WATCHED = 3_000  # environment steps after each batch of which policies are played; later after every fifth
 LEVERS: dict[str, dict[str, Any]] = {
     "as preset": {},
     "one episode per batch": {"num_envs": 1, "rollout_steps": 200},
@@ -41,7 +42,8 @@ LEVERS: dict[str, dict[str, Any]] = {
     "learned exploration": {"exploration": "learned"},
     "discount 0.98": {"discount": 0.98},
     "the newest 1,000 steps alone": {"replay": 1_000},
-    "noise of differences x 20": {"noise": 0.02},
+    "noise of differences 0.02": {"noise": 0.02},
+    "noise of differences 0.001": {"noise": 0.001},
     "state length scales 0.3": {"lengthscale": 0.3},
     "unit action length scale": {"action_lengthscale": 1.0},
     "half the basis": {"budget": 75},
@@ -95,6 +97,8 @@ def run(lever: str, first: int, options: Options) -> dict[str, Any]:
     starts = FixedStarts(TASK, count, options.episodes)
     frames, returns, since = [], [], time.process_time()
     for _ in learner.train():
+        if learner.frames > WATCHED and learner.updates % 5:
+            continue
         frames.append(learner.frames)
         returns.append(evaluate(starts, learner.policy).mean(-1).tolist())
         if learner.frames >= options.frames:

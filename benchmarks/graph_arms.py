@@ -2,7 +2,7 @@
 
 Hyper-parameters maximise the marginal likelihood of held-out trajectories: those of the graph kernels are
 tuned on a graph that lacks them, since a graph tells more of its own vertices than of new states. Graphs of
-visited states are measured in units that a Matérn 3/2 kernel, tuned on the same trajectories, suggests. The
+visited states are measured in units that a Matérn 1/2 kernel, tuned on the same trajectories, suggests. The
 sparse online process then learns from all trajectories in random blocks, graphs growing along.
 """
 
@@ -125,7 +125,7 @@ class Tuned:
             return gp
 
         if isinstance(self.graph, Experience) and arm.suited:
-            ordinary = Matern(dims)
+            ordinary = Matern(dims, smoothness=0.5)
             fit(ordinary)
             suit(self.kernel, self.graph, ordinary.lengthscale.detach())
         gp = fit(self.kernel)

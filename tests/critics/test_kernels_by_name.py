@@ -15,6 +15,7 @@ from torch_gprl.critics import (
     graph_edges,
     graphs,
     store_transitions,
+    suit_graphs,
 )
 from torch_gprl.gp import SparseOnlineGP
 from torch_gprl.graphs import Experience, TransitionGraph
@@ -135,3 +136,19 @@ def test_edges_are_those_of_neighbours_or_of_visited_steps():
     assert isinstance(graph, TransitionGraph)
     assert len(edges) == graph.degrees()[0].sum() / 2
     assert list(graph_edges(made("matern-1/2"), 0)) == []
+
+
+def test_a_graph_is_measured_by_what_values_depend_on():
+    critic, data = made("successor"), transitions()
+    store_transitions(critic, data)
+    x = critic.inputs(data["observation"], data["action"])
+    (graph,) = graphs(critic)
+    assert isinstance(graph, Experience)
+    nodes = graph.nearest(x[..., :STATES]).nodes
+    values = (3 * x[..., 0]).sin() + 0.01 * torch.randn(x.shape[:-1], dtype=torch.float64)
+    suit_graphs(critic, x[:, :40], values[:, :40], 40)
+    assert (graph.lengthscale[:, 0] < 0.8 * graph.lengthscale[:, 1]).all()
+    assert not torch.equal(graph.nearest(x[..., :STATES]).nodes, nodes)
+    ordinary = made("matern-3/2")
+    suit_graphs(ordinary, x, values, 1)  # nothing to do
+    torch.testing.assert_close(ordinary.gp.kernel(x, x), made("matern-3/2").gp.kernel(x, x))

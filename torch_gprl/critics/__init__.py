@@ -12,6 +12,7 @@ from torch_gprl.critics.kernels_by_name import (
     graph_edges,
     graphs,
     store_transitions,
+    suit_graphs,
 )
 from torch_gprl.critics.maximise import ActionMaximiser, Maximum
 from torch_gprl.critics.planned_value import PlannedValue, Planning
@@ -46,4 +47,5 @@ __all__ = [
     "interval_coverage",
     "k_step_returns",
     "store_transitions",
+    "suit_graphs",
 ]

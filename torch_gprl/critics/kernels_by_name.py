@@ -3,7 +3,8 @@
 k((s, a), (s', a')) = k_s(s, s') · k_a(a, a'), with any kernel of states k_s and a squared exponential k_a,
 which keeps averages over a Gaussian policy in closed form. The graph of a kernel belongs to it, and so to
 what is saved and moved with the critic. A learner calls `store_transitions` before the critic learns them,
-`follow_basis` afterwards, and `clear_graphs` when it scales the inputs anew.
+`follow_basis` afterwards, `clear_graphs` when it scales the inputs anew, and `suit_graphs` when it fits
+hyper-parameters.
 """
 
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torch_gprl.critics.action_value import GPActionValue
+from torch_gprl.gp import SparseOnlineGP, fit_hyperparameters
 from torch_gprl.graphs import Experience, NearestEdges, TransitionGraph
 from torch_gprl.kernels import (
     Columns,
@@ -130,6 +132,33 @@ def store_transitions(critic: GPActionValue, transitions: TensorDictBase) -> Non
         terminated = following.get("terminated").reshape(states.shape[:-1])
         newest = slice(-graph.capacity, None)
         graph.add(states[:, newest], next_states[:, newest], terminated[:, newest])
+
+
+def suit_graphs(
+    critic: GPActionValue,
+    inputs: Float[Tensor, "learners N D"],
+    targets: Float[Tensor, "learners N"],
+    steps: int,
+) -> None:
+    """Take the length scales of a successor kernel from an ordinary one fitted to values; others stay.
+
+    Args:
+        critic: whose kernel it is.
+        inputs: scaled states and actions [learners, N, D].
+        targets: their standardised values [learners, N].
+        steps: of the optimiser.
+    """
+    for kernel in critic.gp.kernel.modules():
+        if not isinstance(kernel, SuccessorWithRest):
+            continue
+        learners, dims, states = len(inputs), inputs.shape[-1], kernel.input_dim
+        of_states = Matern(states, batch_shape=(learners,), smoothness=0.5)
+        of_actions = SquaredExponential(dims - states, batch_shape=(learners,))
+        ordinary = Columns(of_states, tuple(range(states)), dims)
+        ordinary = ordinary * Columns(of_actions, tuple(range(states, dims)), dims)
+        noise = critic.gp.noise_variance.detach()
+        fit_hyperparameters(SparseOnlineGP(ordinary.to(inputs), 1, noise), inputs, targets, steps)
+        kernel.suit(of_states.lengthscale)
 
 
 @torch.no_grad()

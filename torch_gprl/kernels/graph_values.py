@@ -17,9 +17,7 @@ from torch_gprl.kernels.graph_successor import FIRST_DOUBT, SuccessorKernel
 from torch_gprl.kernels.parameters import PositiveValue
 from torch_gprl.kernels.stationary import Matern
 
-REWARDS = (
-    2.0  # length scales of rewards in those of values: a reward is smoother than a sum of them with jumps
-)
+REWARDS = 2.0  # length scales of rewards, in those of values, which are rougher
 REST = 0.2  # prior variance of what the successor kernel cannot tell
 WIDE, NARROW = 1.0, 0.3  # standard deviations of logarithms
 
@@ -61,7 +59,7 @@ class SuccessorWithRest(Sum):
         See `Experience.pulled_back`. What a process has learned needs `rebase` afterwards.
 
         Args:
-            lengthscale: of a Matérn 3/2 kernel fitted to values [*batch, D], in units of the inputs.
+            lengthscale: of a Matérn 1/2 kernel fitted to values [*batch, D], in units of the inputs.
         """
         experience = self.told.experience
         experience.measure(experience.pulled_back(lengthscale.detach(), self.told.discount))

@@ -21,6 +21,7 @@ from torch_gprl.critics import (
     follow_basis,
     graphs,
     store_transitions,
+    suit_graphs,
 )
 from torch_gprl.critics.difference_equations import Transitions
 from torch_gprl.gp import AgeAwareScore, InformationScore, SparseOnlineGP, fit_hyperparameters
@@ -111,14 +112,22 @@ class Teacher:
         if self.fresh < RENEWED_SHARE * len(self.experience):
             store_transitions(self.critic, rollout)
             return
-        self.fresh, critic, remembered = 0, self.critic, self.experience.all()
+        self.fresh, critic, remembered = 0, self.critic, self._remembered()
         observation, action = remembered.get("observation"), remembered.get("action")
         critic.standardise(observation, action, remembered.get(("next", "reward")))
         self._scale_values(remembered)
         clear_graphs(critic)
-        store_transitions(critic, remembered)
+        store_transitions(critic, self.experience.all())
         dims = observation.shape[-1], action.shape[-1]
         critic.cover(observation, action, _lengthscale(*dims, self.config).to(critic.input_loc))
+
+    def _remembered(self) -> TensorDictBase:
+        """Experience [learners, steps], evenly thinned to what is solved at once.
+
+        Old experience stays for what the policy no longer visits: forgetting that ends in a relapse.
+        """
+        assert self.experience is not None
+        return _spread_over(self.experience.all(), self.config.solved)
 
     @torch.no_grad()
     def _scale_values(self, remembered: TensorDictBase) -> None:
@@ -130,9 +139,8 @@ class Teacher:
         critic.gp.log_noise_variance.fill_(math.log(self.config.noise * rest**2))
 
     def solve_anew(self) -> TensorDictBase:
-        """Solve the differences of all experience under today's policy; some of it [learners, 1, steps]."""
-        assert self.experience is not None
-        remembered = self.experience.all()
+        """Solve the differences of experience under today's policy; some of it [learners, 1, steps]."""
+        remembered = self._remembered()
         self.critic.resolve(remembered, self.policy, self.config.discount)
         return _spread_over(remembered, IMPROVED_STATES).unsqueeze(1)
 
@@ -157,18 +165,18 @@ class Teacher:
         A graph tells more of the states that it stands on than of new ones.
         """
         critic, points = self.critic, rollout
-        if any(True for _ in graphs(critic)):
+        on_graph = any(True for _ in graphs(critic))
+        if on_graph:
             stored, points = rollout.chunk(2, dim=1 if rollout.shape[1] > 1 else 2)
             store_transitions(critic, stored)
             states = critic.inputs(stored.get("observation"), stored.get("action"))
             follow_basis(critic, _spread_over(states, min(TUNING_NODES, self.config.budget)))
-            steps //= GRAPH_FITS_SHORTER
         inputs = critic.inputs(points.get("observation"), points.get("action"))
         targets = critic.standard_targets(points.get("value_target"))
         if inputs.shape[1] >= LEAST_FIT_POINTS:  # fewer tell nothing: the first guess, or the last fit, stays
-            fit_hyperparameters(
-                critic.gp, _spread_over(inputs, FIT_POINTS), _spread_over(targets, FIT_POINTS), steps
-            )
+            inputs, targets = _spread_over(inputs, FIT_POINTS), _spread_over(targets, FIT_POINTS)
+            suit_graphs(critic, inputs, targets, steps)
+            fit_hyperparameters(critic.gp, inputs, targets, steps // (GRAPH_FITS_SHORTER if on_graph else 1))
         clear_graphs(critic)
 
     def figures(self) -> dict[str, Tensor]:

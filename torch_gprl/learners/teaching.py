@@ -129,14 +129,6 @@ class Teacher:
         assert self.experience is not None
         return _spread_over(self.experience.all(), self.config.solved)
 
-    def _remembered(self) -> TensorDictBase:
-        """Experience [learners, steps], evenly thinned to what is solved at once.
-
-        Old experience stays for what the policy no longer visits: forgetting that ends in a relapse.
-        """
-        assert self.experience is not None
-        return _spread_over(self.experience.all(), self.config.solved)
-
     @torch.no_grad()
     def _scale_values(self, remembered: TensorDictBase) -> None:
         """The prior of values by the moments of the reward: where nothing is known they stay at its mean."""

@@ -108,6 +108,16 @@ def test_a_replay_keeps_the_newest_transitions_and_the_critic_knows_no_others():
         assert (figures["outdated"] == 0).all()
 
 
+def test_experience_beyond_what_is_solved_is_thinned_and_its_oldest_step_stays():
+    made = learner(updates=2, targets="differences", replay=200, solved=70)
+    list(made.train())
+    some, everything = made.teacher.solve_anew(), made.experience.all()
+    assert made.critic.gp.observations.tolist() == [some.shape[-1]] * 2 == [70] * 2
+    assert everything.shape[1] == 200
+    for end in (0, -1):
+        assert torch.equal(some["observation"][:, 0, end], everything["observation"][:, end])
+
+
 def test_improvements_move_the_policy_by_what_is_remembered():
     moved = {}
     for improvements in (0, 3):

@@ -33,6 +33,7 @@ from train import POLICY_GRADIENT_PRESETS
 
 TASK, THRESHOLD = "Pendulum-v1", -200.0
 SIDE_BY_SIDE = 5  # learners of one record
+COLOURS = 10  # of a picture's lines before they repeat
 WATCHED = 3_000  # environment steps after each batch of which policies are played; later after every fifth
 LEVERS: dict[str, dict[str, Any]] = {
     "as preset": {},
@@ -42,8 +43,8 @@ LEVERS: dict[str, dict[str, Any]] = {
     "learned exploration": {"exploration": "learned"},
     "discount 0.98": {"discount": 0.98},
     "the newest 1,000 steps alone": {"replay": 1_000},
+    "the newest 4,000, noise 0.005": {"replay": 4_000, "noise": 0.005},
     "noise of differences 0.02": {"noise": 0.02},
-    "noise of differences 0.001": {"noise": 0.001},
     "state length scales 0.3": {"lengthscale": 0.3},
     "unit action length scale": {"action_lengthscale": 1.0},
     "half the basis": {"budget": 75},
@@ -144,9 +145,9 @@ def draw(records: Sequence[dict[str, Any]]) -> Figure:
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     longest = max(records, key=lambda record: record["frames"][-1])
-    for record in records:
-        if record is not longest:
-            left.plot(record["frames"], np.median(record["returns"], axis=1), label=record["lever"])
+    for place, record in enumerate(record for record in records if record is not longest):
+        style = "-" if place < COLOURS else "--"
+        left.plot(record["frames"], np.median(record["returns"], axis=1), style, label=record["lever"])
     right.plot(longest["frames"], longest["returns"], color="#1f4e8c", alpha=0.4, linewidth=1)
     right.plot(longest["frames"], np.median(longest["returns"], axis=1), color="#1f4e8c", label="median")
     left.set_title("one number changed: median of the learners", fontsize="medium")

@@ -141,10 +141,8 @@ class PlannedPolicy(TensorDictModuleBase):
             draw = self.noise.draw(torch.cat([like, like[..., :1]], -1))
             action, noise = self._drawn(states, torch.special.ndtr(draw[..., :1])), draw[..., 1:]
         else:
-            action, noise = (
-                self._value.best_action(states, explore=scheme != "gaussian"),
-                self.noise.draw(like),
-            )
+            noise = self.noise.draw(like)
+            action = self._value.best_action(states, explore=scheme != "gaussian")
         return torch.clamp(action + self.std_at(states, action) * noise, -1, 1)
 
     def std_at(self, states: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"]) -> Tensor:

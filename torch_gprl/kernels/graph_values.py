@@ -51,7 +51,20 @@ class SuccessorWithRest(Sum):
         told.set_prior("doubt", LogNormal(math.log(FIRST_DOUBT), NARROW))
         rest.set_prior("outputscale", LogNormal(math.log(REST), NARROW))
         super().__init__(told, rest)
-        self.told, self.rest = told, rest
+
+    @property
+    def told(self) -> SuccessorKernel:
+        """What experience tells."""
+        told = self.kernels[0]
+        assert isinstance(told, SuccessorKernel)
+        return told
+
+    @property
+    def rest(self) -> Matern:
+        """What it cannot tell."""
+        rest = self.kernels[1]
+        assert isinstance(rest, Matern)
+        return rest
 
     def suit(self, lengthscale: Float[Tensor, "*#batch D"]) -> None:
         """Take all length scales, and the units of the graph, from those of an ordinary kernel of values.

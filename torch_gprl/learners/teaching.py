@@ -60,7 +60,8 @@ def make_critic(policy: GaussianPolicy, config: PolicyGradientConfig, learners: 
     pruning = InformationScore()
     if config.age_weight:
         pruning = AgeAwareScore(config.age_weight, config.age_form, config.age_timescale)
-    kernel.requires_grad_(config.targets == "returns")
+    if config.targets == "differences":
+        kernel.requires_grad_(False)
     gp = SparseOnlineGP(kernel, config.budget, FIRST_NOISE, config.novelty_threshold, pruning=pruning)
     low, high = head.centre - head.half_range, head.centre + head.half_range
     return GPActionValue(gp, action_low=low, action_high=high)

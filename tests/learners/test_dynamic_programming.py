@@ -74,7 +74,15 @@ def test_ends_of_the_task_are_learned():
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("discount", 1.0), ("total_frames", 0), ("lengthscale", 0.0), ("std", -1.0)]
+    ("field", "value"),
+    [
+        ("discount", 1.0),
+        ("total_frames", 0),
+        ("lengthscale", 0.0),
+        ("hold", 0),
+        ("smoothness", 1.0),
+        ("std", -1.0),
+    ],
 )
 def test_numbers_out_of_range_are_named(field, value):
     with pytest.raises(ValueError, match=rf"{field} must .*{value}"):

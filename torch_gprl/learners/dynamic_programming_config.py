@@ -57,6 +57,8 @@ class DynamicProgrammingConfig(PlannedBehaviour):
         """
         super().__post_init__()
         check_ranges(self, least=LEAST, positive=POSITIVE, discounts=("discount",))
+        if self.smoothness not in (0.5, 1.5, 2.5):
+            raise ValueError(f"smoothness must be 0.5, 1.5 or 2.5, got {self.smoothness}")
 
     @property
     def planning(self) -> Planning:

@@ -44,3 +44,15 @@ def take(new: Support, old: Support, better: Tensor) -> Support:
             for ours, theirs in zip(new, old, strict=True)
         )
     )
+
+
+def with_places(plan: Support, places: int, nowhere: float) -> Support:
+    """The plan with so many places for ends; what it has not filled lies `nowhere`, far from all states."""
+    more = places - plan.ends.shape[1]
+
+    def filled(values: Tensor, number: float) -> Tensor:
+        return torch.cat([values, values.new_full((len(values), more, *values.shape[2:]), number)], 1)
+
+    return plan._replace(
+        scaled=filled(plan.scaled, nowhere), ends=filled(plan.ends, 0.0), weights=filled(plan.weights, 0.0)
+    )

@@ -34,7 +34,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_gprl.critics.maximise import candidate_actions
-from torch_gprl.critics.plan import Course, Seen, Support, take
+from torch_gprl.critics.plan import Course, Seen, Support, take, with_places
 from torch_gprl.critics.transition_model import TransitionModel, Transitions
 from torch_gprl.gp import Posterior
 from torch_gprl.graphs import farthest_points
@@ -134,10 +134,13 @@ class PlannedValue:
         """Replace the trusted plan where the new one is no worse."""
         new, old = self._support, self._trusted
         assert new is not None
-        alike = old is not None and old.scaled.shape == new.scaled.shape  # the first end changes shapes
+        alike = (
+            old is not None and old.observation.shape == new.observation.shape
+        )  # few states to choose from
         if old is None or not alike or not self.planning.trial:
             self._trusted = new
             return
+        old = with_places(old, new.ends.shape[1], NOWHERE)  # some learner may have met the first end
         steps = data.reward.shape[1]
         spread = torch.linspace(0, steps - 1, min(TRIALS, steps), device=data.reward.device).long()
         states = data.observation[:, spread]

@@ -1,6 +1,6 @@
 """The numbers of dynamic programming on a learned model, each with its unit: they become the command line."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from torch_gprl.critics.planned_value import Planning
 from torch_gprl.learners.ranges import check_ranges
@@ -63,17 +63,4 @@ class DynamicProgrammingConfig(PlannedBehaviour):
     @property
     def planning(self) -> Planning:
         """The numbers of a plan."""
-        return Planning(
-            self.discount,
-            self.support,
-            self.imagined,
-            self.sweeps,
-            self.backup_actions,
-            self.lengthscale,
-            self.novelty_lengthscale,
-            self.tremble,
-            self.optimism,
-            self.hold,
-            self.smoothness,
-            self.trial,
-        )
+        return Planning(**{each.name: getattr(self, each.name) for each in fields(Planning)})

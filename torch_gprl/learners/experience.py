@@ -79,6 +79,8 @@ class Experience:
 
 def _reserve(folder: Path) -> None:
     """Claim the files' room on the disk: a memory-mapped page without it would end the process unheard."""
+    if not hasattr(os, "posix_fallocate"):  # macOS and Windows have no such call
+        return
     for path in folder.rglob("*.memmap"):
         with path.open("r+b") as file:
             os.posix_fallocate(file.fileno(), 0, path.stat().st_size)

@@ -136,21 +136,22 @@ class BatchEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         # The checks of the public constructor would cost a tenth of a step of 64 small simulations.
-        return TensorDict._new_unsafe(self._outcome(tensordict), self._shape, device=self._to[0])
+        return TensorDict._new_unsafe(self._outcome(tensordict)[0], self._shape, device=self._to[0])
 
-    def _outcome(self, tensordict: TensorDictBase) -> dict[str, Tensor | TensorDictBase]:
-        """What a step under the given action leads to."""
+    def _outcome(self, tensordict: TensorDictBase) -> tuple[dict[str, Tensor | TensorDictBase], bool]:
+        """What a step under the given action leads to, and whether it ends any episode."""
         observation, reward, parts, terminated, truncated = self._copies.step(self._command(tensordict))
+        done = terminated | truncated
         out: dict[str, Tensor | TensorDictBase] = {
             "observation": self._out(observation),
             "reward": self._out(reward),
             "terminated": self._tensor(terminated),
             "truncated": self._tensor(truncated),
-            "done": self._tensor(terminated | truncated),
+            "done": self._tensor(done),
         }
         if self._parts:
             out["info"] = TensorDict({name: self._out(parts[name]) for name in self._parts}, self._shape)
-        return out
+        return out, bool(done.any())  # asked here: after a step, torch's first operation is the dear one
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """A step, then a reset of what is done; as TorchRL's, without the cases that we do not have."""
@@ -158,7 +159,7 @@ class BatchEnv(EnvBase):
         foreign = tensordict.batch_size != self._shape or tensordict.device != self._to[0]
         if foreign or "next" in keys or "_step" in keys:
             return super().step_and_maybe_reset(tensordict)
-        outcome, device = self._outcome(tensordict), self._to[0]
+        (outcome, ended), device = self._outcome(tensordict), self._to[0]
         # The next step begins with all that this one had, and all that came after it but the reward.
         entries = dict(tensordict.items()) | outcome
         for key, value in entries.items():
@@ -169,7 +170,7 @@ class BatchEnv(EnvBase):
         step = TensorDict._new_unsafe(outcome, self._shape, device=device)
         tensordict._set_str("next", step, validated=True, inplace=False, non_blocking=False)
         following = TensorDict._new_unsafe(entries, self._shape, device=device)
-        return tensordict, self.maybe_reset(following) if outcome["done"].any() else following
+        return tensordict, self.maybe_reset(following) if ended else following
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         """Nothing: TorchRL completes and reshapes entries here, and `_step` leaves none to mend."""

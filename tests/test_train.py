@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import importlib.util
-import os
 import re
 import shutil
 import signal
@@ -99,49 +98,44 @@ def test_the_checkpoint_holds_what_was_learned(tiny_run):
     assert (learner.updates, learner.frames) == (2, 800)
 
 
-class Forked:
-    """The command line in a fork, which needs no new imports."""
+class Process:
+    """The command line in a process of its own; its film is short."""
+
+    PROGRAM = "import sys, train; train.LONGEST_FILM = 2; sys.exit(train.main(sys.argv[1:]))"
 
     def __init__(self, arguments: list[str], folder: Path) -> None:
         self.output, self.errors = folder / "output", folder / "errors"
-        self.output.touch(), self.errors.touch()
-        self.pid = os.fork()
-        if not self.pid:
-            code = 70
-            try:
-                sys.stdout, sys.stderr = self.output.open("w"), self.errors.open("w", buffering=1)
-                os.dup2(sys.stderr.fileno(), 2)
-                code = train.main(arguments)
-                sys.stdout.flush(), sys.stderr.flush()
-            finally:
-                os._exit(code)
+        command = [sys.executable, "-c", self.PROGRAM, *arguments]
+        with self.output.open("w") as output, self.errors.open("w") as errors:
+            self._process = subprocess.Popen(
+                command, stdout=output, stderr=errors, cwd=Path(train.__file__).parent
+            )
 
     def interrupt(self) -> None:
-        os.kill(self.pid, signal.SIGINT)
+        self._process.send_signal(signal.SIGINT)
 
     def wait_for(self, condition: Callable[[], bool]) -> None:
         deadline = time.monotonic() + 120
         while not condition():
-            assert os.waitpid(self.pid, os.WNOHANG) == (0, 0), self.errors.read_text(encoding="utf-8")
+            assert self._process.poll() is None, self.errors.read_text(encoding="utf-8")
             assert time.monotonic() < deadline
             time.sleep(0.01)
 
     def end(self) -> tuple[int, str, str]:
         """Exit code, output, errors."""
-        code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+        code = self._process.wait()
         return code, self.output.read_text(encoding="utf-8"), self.errors.read_text(encoding="utf-8")
 
 
-def an_endless_run(folder: Path) -> Forked:
+def an_endless_run(folder: Path) -> Process:
     """A run that has made its first update and would go on for days."""
-    run = Forked([*TINY, "--total-frames", "1000000000", "--out", str(folder / "run")], folder)
+    run = Process([*TINY, "--total-frames", "1000000000", "--out", str(folder / "run")], folder)
     metrics = folder / "run" / "metrics.csv"
     run.wait_for(lambda: metrics.exists() and metrics.read_text(encoding="utf-8").count("\n") > 2)
     return run
 
 
-def test_ctrl_c_keeps_what_was_learned(tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "LONGEST_FILM", 2)
+def test_ctrl_c_keeps_what_was_learned(tmp_path):
     run = an_endless_run(tmp_path)
     run.interrupt()
     code, output, errors = run.end()

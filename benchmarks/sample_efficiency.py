@@ -14,6 +14,7 @@ Each finished (task, arm, seeds) is a record in --out, and a rerun skips what is
 
 import json
 import time
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -118,13 +119,16 @@ def measure(options: Options, console: Console) -> None:
             progress.advance(bar)
 
 
-def check(options: Options) -> None:
+def check(**names: tuple[Iterable[str], Collection[str]]) -> None:
     """Refuse names that do not exist.
+
+    Args:
+        names: by their kind, those that were chosen and those that there are.
 
     Raises:
         ValueError: naming what there is.
     """
-    for kind, chosen, known in (("task", options.tasks, GOALS), ("arm", options.arms, ARMS)):
+    for kind, (chosen, known) in names.items():
         for name in chosen:
             if name not in known:
                 raise ValueError(f"unknown {kind} {name!r}; choose from {', '.join(known)}")
@@ -132,7 +136,7 @@ def check(options: Options) -> None:
 
 def main(options: Options) -> None:
     """Measure what is missing, print, write."""
-    check(options)
+    check(task=(options.tasks, GOALS), arm=(options.arms, ARMS))
     torch.set_num_threads(1)
     if not options.report:
         measure(options, Console(stderr=True))

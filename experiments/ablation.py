@@ -48,18 +48,6 @@ class Options:
     out: Path = Path("experiments/results/ablation.json")
 
 
-def check(options: Options) -> None:
-    """Refuse names that do not exist.
-
-    Raises:
-        ValueError: naming what there is.
-    """
-    for kind, chosen, known in (("task", options.tasks, GOALS), ("row", options.rows, ROWS)):
-        for name in chosen:
-            if name not in known:
-                raise ValueError(f"unknown {kind} {name!r}; choose from {', '.join(known)}")
-
-
 def run(task: str, row: str, options: Options) -> dict[str, Any]:
     """Train the learners of a row and evaluate them on the way."""
     goal = replace(GOALS[task], frames=options.frames, every=options.every)
@@ -72,7 +60,7 @@ def run(task: str, row: str, options: Options) -> dict[str, Any]:
 
 def main(options: Options) -> None:
     """Run the rows that are missing, write after each, print all."""
-    check(options)
+    sample_efficiency.check(task=(options.tasks, GOALS), row=(options.rows, ROWS))
     torch.set_num_threads(1)
     out = options.out
     records = json.loads(out.read_text(encoding="utf-8"))["records"] if out.exists() else []

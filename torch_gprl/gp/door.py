@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,13 +16,15 @@ def admit_inputs(inputs: Tensor, batch_shape: torch.Size, like: Tensor) -> Tenso
         ValueError: the last two dimensions are not (points, input dimensions of the model), or the leading
             ones do not broadcast to `batch_shape`.
     """
-    dims = like.shape[-1]
+    shape, dims = inputs.shape, like.shape[-1]
+    if len(shape) > 1 and shape == (*batch_shape, shape[-2], dims):  # the usual case, told cheaply
+        return inputs if inputs.dtype == like.dtype else inputs.to(like.dtype)
     if inputs.ndim < 2 or inputs.shape[-1] != dims or not _broadcasts(inputs.shape[:-2], batch_shape):
         raise ValueError(
             f"inputs must be [*{tuple(batch_shape)}, points, {dims}], got {tuple(inputs.shape)}; "
             "a single point is inputs[..., None, :]"
         )
-    return _expanded(inputs.to(like.dtype), (*batch_shape, *inputs.shape[-2:]))
+    return inputs.to(like.dtype).expand(*batch_shape, *shape[-2:])
 
 
 def admit_points(
@@ -43,16 +46,12 @@ def admit_data(
         ValueError: shapes that do not fit each other, NaN or infinity in data that count.
     """
     inputs = admit_inputs(inputs, batch_shape, like)
-    expected = inputs.shape[:-1]
-    for name, tensor in (("targets", targets), ("mask", mask)):
-        if tensor is not None and not _broadcasts(tensor.shape, expected):
-            raise ValueError(f"{name} must be {tuple(expected)}, one per input, got {tuple(tensor.shape)}")
-    targets = _expanded(targets.to(like.dtype), expected)
+    targets = _one_per_input("targets", targets, inputs).to(like.dtype)
     if mask is not None:
-        mask = mask.to(torch.bool).expand(expected)
+        mask = _one_per_input("mask", mask, inputs).to(torch.bool)
         inputs = torch.where(mask.unsqueeze(-1), inputs, 0.0)
         targets = torch.where(mask, targets, 0.0)
-    if not math.isfinite(float(inputs.sum() + targets.sum())):  # one synchronisation; details only on failure
+    if not math.isfinite(_size(inputs) + _size(targets)):  # details only on failure
         for name, tensor in (("inputs", inputs), ("targets", targets)):
             refuse_non_finite(name, tensor)
     return inputs, targets, mask
@@ -87,8 +86,21 @@ def admit_successors(
     return GaussianInputs(mean, variance, next_inputs.columns), rate
 
 
-def _expanded(tensor: Tensor, shape: tuple[int, ...]) -> Tensor:
-    return tensor if tensor.shape == shape else tensor.expand(shape)
+def _size(tensor: Tensor) -> float:
+    """A number that is not finite if an entry is not: one synchronisation; on the CPU NumPy's is cheaper."""
+    if tensor.device.type != "cpu":
+        return float(tensor.sum())
+    array = tensor.detach().numpy()
+    return float(np.vdot(array, array))
+
+
+def _one_per_input(name: str, tensor: Tensor, inputs: Tensor) -> Tensor:
+    expected = inputs.shape[:-1]
+    if tensor.shape == expected:
+        return tensor
+    if not _broadcasts(tensor.shape, expected):
+        raise ValueError(f"{name} must be {tuple(expected)}, one per input, got {tuple(tensor.shape)}")
+    return tensor.expand(expected)
 
 
 def _broadcasts(shape: torch.Size, target: torch.Size) -> bool:

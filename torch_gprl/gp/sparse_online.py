@@ -14,10 +14,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torch_gprl.gp import one_learner
+from torch_gprl.gp import one_learner, one_point
 from torch_gprl.gp.bounded import BoundedBasis
-from torch_gprl.gp.door import admit_data, admit_successors
+from torch_gprl.gp.door import admit_data, admit_inputs, admit_successors
 from torch_gprl.gp.observed import Observed
+from torch_gprl.gp.posterior import Posterior
 from torch_gprl.kernels.gaussian_inputs import GaussianInputs
 
 BLOCK = 256  # points absorbed at once; longer updates are cut into blocks of this size
@@ -81,14 +82,25 @@ class SparseOnlineGP(BoundedBasis):
             self.clock.fill_(stamp)
         if self._kernel_versions() != self._kernel_seen:
             self.rebase()
-        noise, plain = self.noise_variance, mask is None and next_inputs is None
-        if plain and self._is_alone():
-            absorb = partial(one_learner.absorb, self, noise_variance=float(noise))
+        if mask is None and next_inputs is None and self._is_alone():
+            absorb = partial(one_learner.absorb, self, noise_variance=float(self.noise_variance))
         else:
-            absorb = partial(self._absorb_block, noise=noise.unsqueeze(-1))
+            absorb = partial(self._absorb_block, noise=self.noise_variance.unsqueeze(-1))
         points, block = inputs.shape[-2], 1 if self.order == "arrival" else BLOCK
         for start in range(0, points, block):
             absorb(observed if points <= block else observed.block(start, start + block))
+
+    def posterior(self, inputs: Float[Tensor, "*#batch N D"] | GaussianInputs) -> Posterior:
+        """Mean and variance of f (without noise), as told at `WhitenedState.posterior`."""
+        if isinstance(inputs, Tensor) and inputs.shape[-2:-1] == (1,) and self._goes_short_way(inputs):
+            return one_point.posterior(self, admit_inputs(inputs, self.batch_shape, self.basis))
+        return super().posterior(inputs)
+
+    def _goes_short_way(self, inputs: Tensor) -> bool:
+        if torch.compiler.is_compiling() or not self._is_alone():
+            return False
+        tensors = (inputs, *self._kernel_tensors) if torch.is_grad_enabled() else ()
+        return not any(tensor.requires_grad for tensor in tensors)
 
     def _observed(
         self,
@@ -102,10 +114,6 @@ class SparseOnlineGP(BoundedBasis):
             return Observed(inputs, targets, mask, None, None)
         successors = admit_successors(next_inputs, discount, mask, inputs.shape[:-1], self.basis)
         return Observed(inputs, targets, mask, *successors)
-
-    def _is_alone(self) -> bool:
-        """Whether there is one learner, on the CPU, which may go the short way."""
-        return self.size.numel() == 1 and self.size.device.type == "cpu"
 
     def _absorb_block(self, block: Observed, noise: Tensor) -> None:
         phi, novelty = self._grow(block.inputs, block.mask, noise)

@@ -248,7 +248,8 @@ class WhitenedState(nn.Module):
         self._kernel_seen = self._kernel_versions()
         self._solution: Solved | None = None
         self._active_rows: Active | None = None
-        self._in_use: Any = None  # views of them for a learner that is alone, see `one_learner`
+        self._in_use: Any = None  # arrays of a learner that is alone, see `one_point`
+        self._reader: Any = None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "WhitenedState":
         super()._apply(fn, recurse)
@@ -259,7 +260,7 @@ class WhitenedState(nn.Module):
     def __getstate__(self) -> dict[str, Any]:
         """Without what is derived, which a copy makes anew."""
         _before_save(self, "", False)
-        return {**self.__dict__, "_active_rows": None, "_in_use": None, "_solution": None}
+        return {**self.__dict__, "_active_rows": None, "_in_use": None, "_reader": None, "_solution": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
@@ -272,6 +273,11 @@ class WhitenedState(nn.Module):
 
     def _kernel_versions(self) -> tuple[int, ...]:
         return id(self.kernel), *(tensor._version for tensor in self._kernel_tensors)
+
+    def _is_alone(self) -> bool:
+        """Whether there is one learner, on the CPU, which may go the short way."""
+        size = self._buffers["size"]
+        return size is not None and size.numel() == 1 and size.is_cpu
 
     def _active(self) -> Active:
         """The rows in use. On a GPU all rows: asking how many are used would wait for the device."""

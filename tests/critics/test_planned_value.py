@@ -98,6 +98,21 @@ def test_an_end_is_worth_nothing_and_attracts_where_every_step_costs():
     )
 
 
+def test_a_prize_that_was_paid_once_in_hundreds_of_steps_is_not_smeared_over_the_way():
+    data = walk(learners=1, steps=400)
+    data = data._replace(reward=-0.1 * data.action.square().squeeze(-1))
+    data.observation[:, 250], data.action[:, 250], data.following[:, 250] = 2.3, 1.0, 2.8
+    data.terminated[:, 250], data.reward[:, 250] = 1.0, 100.0
+    value = planned(data)
+    goal, action = torch.full((1, 1, 1), 2.3, dtype=torch.float64), torch.ones(1, 1, 1, dtype=torch.float64)
+    torch.testing.assert_close(value.reward(goal, action).item(), 100.0, rtol=0, atol=5.0)
+    away = grid()[:1]
+    torch.testing.assert_close(
+        value.reward(away, torch.zeros_like(away)), torch.zeros_like(away[..., 0]), rtol=0, atol=0.1
+    )
+    assert (value.best_action(goal, explore=False) > 0.5).all()
+
+
 def test_a_trembling_hand_keeps_away_from_an_edge():
     """Every step is paid 1 until the end beyond 1: of the actions that stay, all are worth the same."""
     data = walk(end=1.0)

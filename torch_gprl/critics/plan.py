@@ -18,15 +18,6 @@ class Support(NamedTuple):
     weights: Tensor  # [L, M + E, 2]
 
 
-class Seen(NamedTuple):
-    """Visited states, their labels as ends, and what judges new ones."""
-
-    scaled: Tensor  # [L, R, S]
-    labels: Tensor  # [L, R]
-    label_weights: Tensor  # [L, R, 1]
-    novelty_factor: Tensor  # [L, R, R]
-
-
 class Course(NamedTuple):
     """Where an action leads that is held for some steps."""
 

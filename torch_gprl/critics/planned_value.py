@@ -12,7 +12,7 @@ reward. An agent still chooses anew at every step.
 The process has a Matérn 1/2 kernel. Its predictions are nearly convex combinations of the values at the
 support, so sweeps nearly contract; a smoother kernel overshoots and the maximum then feeds on it. Values also
 keep to the attainable range. Support states are visited ones, states a few imagined steps away, and the ends
-that were seen, whose value is zero.
+that were met, whose value is zero: what an end pays belongs to the step that leads there.
 
 The maximum is taken over averages of nearby actions, as if the hand trembled. Where many actions serve
 equally well, up to an edge beyond which none does, this keeps away from the edge.
@@ -33,20 +33,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torch_gprl.critics.ends import NOWHERE, Ends
 from torch_gprl.critics.maximise import candidate_actions
-from torch_gprl.critics.plan import Course, Seen, Support, take, with_places
-from torch_gprl.critics.transition_model import TransitionModel, Transitions
+from torch_gprl.critics.plan import Course, Support, take, with_places
+from torch_gprl.critics.transition_model import Prediction, TransitionModel, Transitions
 from torch_gprl.gp import Posterior
 from torch_gprl.graphs import farthest_points
 from torch_gprl.kernels import Kernel, Matern, SquaredExponential
 from torch_gprl.linalg import cholesky
 
 EXPLOIT, EXPLORE = 0, 1  # columns of the values
-VALUE_NOISE, LABEL_NOISE, NOVELTY_NOISE = 1e-3, 1e-3, 1e-2  # of regressions under kernels of variance 1
+VALUE_NOISE, NOVELTY_NOISE = 1e-3, 1e-2  # of regressions under kernels of variance 1
 IMAGINED_STEPS = 2  # from a known state to an imagined one
 FIRST_SWEEPS = 3  # times as many as later: those begin from the last value
-MOST_ENDS = 50  # ends among the support
-NOWHERE = 1e6  # scaled coordinate of the places that a learner with fewer ends leaves empty
 TRIALS = 6  # states of the experience that plans are tried from
 CHUNK = 2**22  # numbers of the largest temporary: bounds the memory
 
@@ -116,7 +115,7 @@ class PlannedValue:
         kernels = self._kernels(data.observation)
         self._judge(data, kernels)
         observation = self._choose(data, uniform)
-        scaled, ends = self._with_ends(self._scaled(observation))
+        scaled = torch.cat([self._scaled(observation), self._ends.scaled], 1)
         self._bound(data)
         average = (self._low + self._high) / 2
         values = average.unsqueeze(-1).expand(*observation.shape[:2], 2)
@@ -126,7 +125,7 @@ class PlannedValue:
         prior = torch.stack([average, self._hope], -1)
         none = torch.zeros_like(prior.expand(-1, scaled.shape[1], -1))
         loc, scale = self.model.loc, self.model.scale
-        self._support = Support(observation, scaled, ends, loc, scale, prior, none)
+        self._support = Support(observation, scaled, self._ends.labels, loc, scale, prior, none)
         self._iterate(values, self.planning.sweeps * (1 if before is not None else FIRST_SWEEPS))
         self._trust(data)
 
@@ -152,10 +151,9 @@ class PlannedValue:
         going, earned = torch.ones_like(states[..., 0]), torch.zeros_like(states[:, 0, 0])
         for _ in range(self.planning.trial):
             values = self._candidate_values(plan, self._backup_actions, states, explore=False)
-            step = self.model.predict(states, self._backup_actions[values.argmax(-1)], doubt=False)
+            step, end = self._step(states, self._backup_actions[values.argmax(-1)], doubt=False)
             earned = earned + (going * step.reward).sum(1)
-            going = going * (self._end(step.observation) < 0.5)
-            states = step.observation
+            going, states = going * (end < 0.5), step.observation
         return earned + (going * self._values_of(self._support, states)[..., EXPLOIT]).sum(1)
 
     def _kernels(self, like: Tensor) -> tuple[Kernel, Kernel]:
@@ -171,30 +169,20 @@ class PlannedValue:
         return (observation - self.model.loc) / (self.model.scale * unit)
 
     def _judge(self, data: Transitions, kernels: tuple[Kernel, Kernel]) -> None:
-        """Learn from all visited states where the task ends, and what is new."""
-        visited = self._scaled(torch.cat([data.observation, data.following], 1))
-        labels = torch.cat([torch.zeros_like(data.terminated), data.terminated], 1)
+        """Learn from all visited states where the task ends, what that pays, and what is new."""
+        visited = self._scaled(data.observation)
         chosen = farthest_points(visited, self.planning.support).chosen
-        scaled = visited.take_along_dim(chosen.unsqueeze(-1), 1)
-        labels = labels.gather(1, chosen)
-        eye = torch.eye(scaled.shape[1], dtype=scaled.dtype, device=scaled.device)
-        factor = cholesky(kernels[0](scaled, scaled) + LABEL_NOISE * eye)
-        weights = torch.cholesky_solve(labels.unsqueeze(-1), factor)
-        novelty_factor = cholesky(kernels[1](scaled, scaled) + NOVELTY_NOISE * eye)
-        self._seen = Seen(scaled, labels, weights, novelty_factor)
-        self._task_ends = bool(labels.any())
-
-    def _end(self, observation: Tensor) -> Float[Tensor, "L N"]:
-        """How far observations look like ends of the task, 0 to 1."""
-        if not self._task_ends:
-            return torch.zeros_like(observation[..., 0])
-        cross = self._kernel(self._scaled(observation), self._seen.scaled)
-        return (cross @ self._seen.label_weights).squeeze(-1).clamp(0, 1)
+        others = visited.take_along_dim(chosen.unsqueeze(-1), 1)
+        surplus = data.reward - self.model.predict(data.observation, data.action, doubt=False).reward
+        self._ends = Ends(kernels[0], others, self._scaled(data.following), data.terminated, surplus)
+        self._seen = torch.cat([others, self._ends.scaled], 1)
+        eye = torch.eye(self._seen.shape[1], dtype=others.dtype, device=others.device)
+        self._novelty_factor = cholesky(kernels[1](self._seen, self._seen) + NOVELTY_NOISE * eye)
 
     def _novelty(self, observation: Tensor) -> Float[Tensor, "L N"]:
         """How little observations look like visited states, 0 to 1."""
-        cross = self._novelty_kernel(self._seen.scaled, self._scaled(observation))
-        known = torch.linalg.solve_triangular(self._seen.novelty_factor, cross, upper=False)
+        cross = self._novelty_kernel(self._seen, self._scaled(observation))
+        known = torch.linalg.solve_triangular(self._novelty_factor, cross, upper=False)
         return (1 - known.square().sum(-2)).clamp(0, 1)
 
     def _choose(self, data: Transitions, uniform: Tensor) -> Float[Tensor, "L M S"]:
@@ -206,19 +194,10 @@ class PlannedValue:
         for action in (2 * uniform[..., 1:] - 1).chunk(IMAGINED_STEPS, -1):
             imagined = self.model.predict(imagined, action, doubt=False).observation
         pool = torch.cat([known, imagined], 1)
-        over = (self._end(pool) > 0.5).unsqueeze(-1)
+        over = (self._ends.judge(self._scaled(pool))[0] > 0.5).unsqueeze(-1)
         pool = torch.where(over, visited[:, -1:], pool)  # visited states that are no ends fill the places
         chosen = farthest_points(self._scaled(pool), self.planning.support).chosen
         return pool.take_along_dim(chosen.unsqueeze(-1), 1)
-
-    def _with_ends(self, scaled: Tensor) -> tuple[Tensor, Tensor]:
-        """Support states in scaled coordinates followed by ends; and which of those are."""
-        if not self._task_ends:
-            return scaled, scaled.new_zeros(len(scaled), 0)
-        ends, places = self._seen.labels.topk(min(MOST_ENDS, self._seen.labels.shape[1]), 1)
-        where = self._seen.scaled.take_along_dim(places.unsqueeze(-1), 1)
-        where = torch.where(ends.unsqueeze(-1) > 0.5, where, NOWHERE)
-        return torch.cat([scaled, where], 1), ends
 
     def _bound(self, data: Transitions) -> None:
         """The attainable range of values [L, 1]."""
@@ -261,13 +240,20 @@ class PlannedValue:
 
     def _course(self, observation: Tensor, action: Tensor, doubt: bool) -> Course:
         """What holding actions leads to."""
-        step = self.model.predict(observation, action, doubt)
-        reward, lasting, unsure = step.reward, 1 - self._end(step.observation), step.doubt
-        for held in range(1, self.planning.hold):
-            step = self.model.predict(step.observation, action, doubt=False)
+        reward, lasting = torch.zeros_like(observation[..., 0]), torch.ones_like(observation[..., 0])
+        unsure = reward
+        for held in range(self.planning.hold):
+            step, end = self._step(observation, action, doubt and not held)
+            observation, unsure = step.observation, unsure + step.doubt  # about the first step
             reward = reward + self.planning.discount**held * lasting * step.reward
-            lasting = lasting * (1 - self._end(step.observation))
-        return Course(step.observation, reward, lasting, unsure)
+            lasting = lasting * (1 - end)
+        return Course(observation, reward, lasting, unsure)
+
+    def _step(self, observation: Tensor, action: Tensor, doubt: bool) -> tuple[Prediction, Tensor]:
+        """What a step leads to, with what an end pays; and how far that looks like an end [L, N], 0 to 1."""
+        step = self.model.predict(observation, action, doubt)
+        end, prize = self._ends.judge(self._scaled(step.observation))
+        return step._replace(reward=step.reward + prize), end
 
     def _trembling(self, actions: Float[Tensor, "J A"]) -> Float[Tensor, "J J"]:
         """Weights by which the value of an action is averaged over actions near it."""
@@ -341,6 +327,17 @@ class PlannedValue:
             value = self._action_values(support, spread, tried, explore)
             values.append(value.unflatten(1, (some.shape[1], -1)) @ trembling.mT)
         return torch.cat(values, 1)
+
+    def reward(
+        self, observation: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"]
+    ) -> Float[Tensor, "L N"]:
+        """The reward that is expected of one step, with what an end pays.
+
+        Args:
+            observation: the states.
+            action: in halves of the actuator's range.
+        """
+        return self._step(observation, action, doubt=False)[0].reward
 
     def unknown(
         self, observation: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"]

@@ -2,7 +2,8 @@
 
 Differences of observations, and rewards, have as their prior a squared exponential for the bends plus a
 linear kernel for what mechanics makes of small steps (Deisenroth, Fox and Rasmussen, 2015, learn the same
-differences). Inputs and targets are standardised by the data.
+differences). Inputs and targets are standardised by the data. Rewards are those of steps that go on; what
+ends pay is learned in `ends`.
 """
 
 import math
@@ -46,7 +47,7 @@ class Prediction(NamedTuple):
 
     Attributes:
         observation: [L, N, S] after the step.
-        reward: [L, N].
+        reward: [L, N] as of a step that does not end the task.
         doubt: [L, N] the share, 0 to 1, of the prior variance of the bends that data have not removed.
     """
 
@@ -159,10 +160,15 @@ class TransitionModel:
         self.loc, self.scale = moments(data.observation)
         low, high = seen.amin(1, keepdim=True), seen.amax(1, keepdim=True)
         self._low, self._high = low - MARGIN * (high - low), high + MARGIN * (high - low)
-        self._reward_low, self._reward_high = data.reward.amin(1, True), data.reward.amax(1, True)
         inputs = self.inputs(data.observation, data.action)
         self.motion.solve(inputs, data.following - data.observation, fit)
-        self.reward.solve(inputs, data.reward.unsqueeze(-1), fit)
+        ended = data.terminated > 0.5
+        # what ends pay is no part of the reward on the way: a step that went on stands in for each of them
+        index = torch.arange(ended.shape[1], device=ended.device).expand_as(ended)
+        index = torch.where(ended, ended.int().argmin(1, keepdim=True), index)
+        reward = data.reward.gather(1, index).unsqueeze(-1)
+        self._reward_low, self._reward_high = reward.amin(1), reward.amax(1)
+        self.reward.solve(inputs.take_along_dim(index.unsqueeze(-1), 1), reward, fit)
 
     def inputs(self, observation: Tensor, action: Tensor) -> Float[Tensor, "L N D"]:
         """Standardised observations beside actions."""

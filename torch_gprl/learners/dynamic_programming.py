@@ -111,7 +111,7 @@ class DynamicProgramming:
         """Root mean square error of the predicted reward on steps that the model has not seen [L]."""
         if not self.critic.planned:
             return torch.full((self.learners,), torch.nan, device=new.reward.device)
-        predicted = self.model.predict(new.observation, new.action, doubt=False).reward
+        predicted = self.critic.reward(new.observation, new.action)
         return (predicted - new.reward).square().mean(1).sqrt()
 
     def _figures(self, rollout: TensorDictBase) -> dict[str, Tensor]:

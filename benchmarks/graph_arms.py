@@ -2,8 +2,9 @@
 
 Hyper-parameters maximise the marginal likelihood of held-out trajectories: those of the graph kernels are
 tuned on a graph that lacks them, since a graph tells more of its own vertices than of new states. Graphs of
-visited states are measured in units that a Matérn 1/2 kernel, tuned on the same trajectories, suggests. The
-sparse online process then learns from all trajectories in random blocks, graphs growing along.
+visited states are measured in units that a Matérn 1/2 kernel, tuned on the same trajectories, suggests; the
+successor kernel takes all its parameters from there. The sparse online process then learns from all
+trajectories in random blocks, graphs growing along.
 """
 
 import time
@@ -46,7 +47,6 @@ class Arm:
 
     graph: Callable[[int, int], Graph]  # from input columns and the number of transitions that will be stored
     kernel: Callable[[Graph, int], Kernel]  # from the graph and input columns
-    suited: bool = True  # units of visited states by an ordinary kernel; else those of the inputs
     budgets: tuple[int, ...] = ()  # basis vectors, if not those of all
 
 
@@ -70,12 +70,12 @@ def _on_nodes(kernel: Callable[[TransitionGraph], Kernel]) -> Arm:
     return Arm(_nodes, make)
 
 
-def _on_experience(kernel: Callable[[Experience], Kernel], suited: bool = True) -> Arm:
+def _on_experience(kernel: Callable[[Experience], Kernel]) -> Arm:
     def make(graph: Graph, dims: int) -> Kernel:
         assert isinstance(graph, Experience)
         return kernel(graph)
 
-    return Arm(_visited, make, suited)
+    return Arm(_visited, make)
 
 
 EUCLIDEAN = {
@@ -95,9 +95,6 @@ ON_GRAPHS = {
     "graph Matérn 3/2": _on_nodes(lambda graph: GraphMatern(graph, interpolate=NEIGHBOURS)),
     "geodesic": _on_experience(lambda visited: GeodesicKernel(visited, DISCOUNT)),
     "successor, no look-ahead": _on_experience(lambda visited: SuccessorWithRest(visited, DISCOUNT, 1.0, 0)),
-    "successor, units of the inputs": _on_experience(
-        lambda visited: SuccessorWithRest(visited, DISCOUNT), suited=False
-    ),
     "successor": _on_experience(lambda visited: SuccessorWithRest(visited, DISCOUNT)),
 }
 ARMS = EUCLIDEAN | ON_GRAPHS | {f"Matérn 1/2, {MEMORY} kept": REMEMBERS}
@@ -119,19 +116,23 @@ class Tuned:
         held_out, targets = seen.states[~kept].flatten(0, 1), seen.targets[~kept].flatten()
         chosen = torch.randperm(len(targets))[:TUNING_POINTS]
 
-        def fit(kernel: Kernel) -> SparseOnlineGP:
+        def fit(kernel: Kernel) -> Tensor:
             gp = SparseOnlineGP(kernel, TUNING_NODES, noise)
             fit_hyperparameters(gp, held_out[chosen], targets[chosen], steps, noise_floor=noise / 4)
-            return gp
+            return gp.noise_variance.detach()
 
-        if isinstance(self.graph, Experience) and arm.suited:
+        if not isinstance(self.graph, Experience):
+            self.noise = fit(self.kernel)
+        else:
             ordinary = Matern(dims, smoothness=0.5)
-            fit(ordinary)
-            suit(self.kernel, self.graph, ordinary.lengthscale.detach())
-        gp = fit(self.kernel)
-        self.noise = gp.noise_variance.detach()
-        if isinstance(self.graph, Experience):
-            grow(self.graph, seen, ~kept)
+            self.noise = fit(ordinary)
+            if isinstance(self.kernel, SuccessorWithRest):
+                grow(self.graph, seen, ~kept)
+                self.kernel.suit(ordinary.lengthscale, ordinary.outputscale)
+            else:
+                self.graph.measure(self.graph.pulled_back(ordinary.lengthscale.detach(), DISCOUNT))
+                self.noise = fit(self.kernel)
+                grow(self.graph, seen, ~kept)
         self.seconds = time.perf_counter() - start
 
     def together(self, budgets: Sequence[int]) -> list[Sequence[int]]:
@@ -153,14 +154,6 @@ class Tuned:
                 if isinstance(self.graph, TransitionGraph):
                     self.graph.follow(gp.basis, gp.mask)
         return processes
-
-
-def suit(kernel: Kernel, visited: Experience, lengthscale: Float[Tensor, " D"]) -> None:
-    """Measure visited states as values that vary over this length scale want it."""
-    if isinstance(kernel, SuccessorWithRest):
-        kernel.suit(lengthscale)
-    else:
-        visited.measure(visited.pulled_back(lengthscale, DISCOUNT))
 
 
 def grow(graph: Graph, seen: Trajectories, which: Tensor) -> None:

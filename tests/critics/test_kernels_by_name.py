@@ -146,9 +146,10 @@ def test_a_graph_is_measured_by_what_values_depend_on():
     assert isinstance(graph, Experience)
     nodes = graph.nearest(x[..., :STATES]).nodes
     values = (3 * x[..., 0]).sin() + 0.01 * torch.randn(x.shape[:-1], dtype=torch.float64)
-    suit_graphs(critic, x[:, :40], values[:, :40], 40)
+    assert suit_graphs(critic, x[:, :40], values[:, :40], 40)
+    assert (critic.gp.noise_variance < 0.01).all()  # as that of these values, not 0.05
     assert (graph.lengthscale[:, 0] < 0.8 * graph.lengthscale[:, 1]).all()
     assert not torch.equal(graph.nearest(x[..., :STATES]).nodes, nodes)
     ordinary = made("matern-3/2")
-    suit_graphs(ordinary, x, values, 1)  # nothing to do
+    assert not suit_graphs(ordinary, x, values, 1)  # nothing to do
     torch.testing.assert_close(ordinary.gp.kernel(x, x), made("matern-3/2").gp.kernel(x, x))

@@ -234,18 +234,18 @@ def test_leading_dimensions_beyond_the_batch_are_more_inputs_of_the_same_learner
         torch.testing.assert_close(found[row], kernel(x[row], z[row]), rtol=0, atol=1e-12)
 
 
-def test_length_scales_of_the_mixture_follow_those_of_values():
-    experience, lengthscale = filled(), torch.tensor([0.4, 9.0], dtype=torch.float64)
+def test_a_mixture_takes_its_parameters_from_an_ordinary_kernel_of_values():
+    experience = filled()
+    ordinary = Matern(2, [0.4, 9.0], 0.6, smoothness=0.5)
     kernel, x = SuccessorWithRest(experience, DISCOUNT), inputs(6)
-    pulled = experience.pulled_back(lengthscale, DISCOUNT)
+    pulled = experience.pulled_back(ordinary.lengthscale, DISCOUNT)
     with torch.no_grad():
         before = kernel(x, x)
-        kernel.suit(lengthscale)
-        told = SuccessorKernel(experience, DISCOUNT, 2 * pulled)
-        rest = Matern(2, lengthscale, kernel.rest.outputscale, smoothness=0.5)
-        torch.testing.assert_close(kernel(x, x), told(x, x) + rest(x, x))
+        kernel.suit(ordinary.lengthscale, ordinary.outputscale)
+        told = SuccessorKernel(experience, DISCOUNT, 2 * pulled, 0.6)
+        torch.testing.assert_close(kernel(x, x), told(x, x) + ordinary(x, x))
         assert not torch.allclose(kernel(x, x), before)
-    torch.testing.assert_close(experience.lengthscale, pulled)
+    torch.testing.assert_close(experience.lengthscale, pulled.detach())
 
 
 def test_only_amplitudes_of_the_mixture_are_fitted_and_with_the_gradient_of_all():

@@ -139,26 +139,38 @@ def suit_graphs(
     inputs: Float[Tensor, "learners N D"],
     targets: Float[Tensor, "learners N"],
     steps: int,
-) -> None:
-    """Take the length scales of a successor kernel from an ordinary one fitted to values; others stay.
+) -> bool:
+    """Take a successor kernel's parameters, and the noise, from an ordinary kernel fitted to values.
+
+    The process should be empty.
 
     Args:
         critic: whose kernel it is.
         inputs: scaled states and actions [learners, N, D].
         targets: their standardised values [learners, N].
         steps: of the optimiser.
+
+    Returns:
+        whether there was such a kernel, and no further fit is wanted.
     """
-    for kernel in critic.gp.kernel.modules():
-        if not isinstance(kernel, SuccessorWithRest):
-            continue
-        learners, dims, states = len(inputs), inputs.shape[-1], kernel.input_dim
+    kernel = critic.gp.kernel
+    successors = [part for part in kernel.modules() if isinstance(part, SuccessorWithRest)]
+    for successor in successors:
+        learners, dims, states = len(inputs), inputs.shape[-1], successor.input_dim
         of_states = Matern(states, batch_shape=(learners,), smoothness=0.5)
         of_actions = SquaredExponential(dims - states, batch_shape=(learners,))
         ordinary = Columns(of_states, tuple(range(states)), dims)
         ordinary = ordinary * Columns(of_actions, tuple(range(states, dims)), dims)
-        noise = critic.gp.noise_variance.detach()
-        fit_hyperparameters(SparseOnlineGP(ordinary.to(inputs), 1, noise), inputs, targets, steps)
-        kernel.suit(of_states.lengthscale)
+        process = SparseOnlineGP(ordinary.to(inputs), 1, critic.gp.noise_variance.detach())
+        fit_hyperparameters(process, inputs, targets, steps)
+        successor.suit(of_states.lengthscale, of_states.outputscale)
+        for part in kernel.modules():
+            if isinstance(part, SquaredExponential):  # that of actions
+                part.load_state_dict(of_actions.state_dict())
+        with torch.no_grad():
+            critic.gp.log_noise_variance.copy_(process.log_noise_variance)
+        critic.gp.rebase()
+    return bool(successors)
 
 
 @torch.no_grad()

@@ -176,8 +176,9 @@ class Teacher:
         targets = critic.standard_targets(points.get("value_target"))
         if inputs.shape[1] >= LEAST_FIT_POINTS:  # fewer tell nothing: the first guess, or the last fit, stays
             inputs, targets = _spread_over(inputs, FIT_POINTS), _spread_over(targets, FIT_POINTS)
-            suit_graphs(critic, inputs, targets, steps)
-            fit_hyperparameters(critic.gp, inputs, targets, steps // (GRAPH_FITS_SHORTER if on_graph else 1))
+            if not suit_graphs(critic, inputs, targets, steps):
+                shorter = GRAPH_FITS_SHORTER if on_graph else 1
+                fit_hyperparameters(critic.gp, inputs, targets, steps // shorter)
         clear_graphs(critic)
 
     def figures(self) -> dict[str, Tensor]:

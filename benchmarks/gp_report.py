@@ -41,6 +41,7 @@ def print_tables(results: dict[str, Any], console: Console) -> None:
         f"{machine['date']}, {machine['processor']}, {machine['threads']} thread, load {machine['load']:.1f}"
     )
     console.print(_streams_table(results["streams"], results["setting"]))
+    console.print(_accuracy_table(results["accuracy"]))
     for variable in VARIABLES:
         console.print(_growth_table(variable, results[variable]))
     console.print(_plain_table("A settled basis beside the machine's matrix product", results["settled"]))
@@ -101,11 +102,19 @@ def _draw_learners(axis: Axes, rows: Rows) -> None:
 
 def _streams_table(rows: Rows, setting: dict[str, int]) -> Table:
     title = f"Budget {setting['budget']}, blocks of {setting['block']}; ratio: ours / theirs"
-    table = _table(title, ("stream", "peer", "updates/s", "ratio", "RMSE", "NLPD"))
+    table = _table(title, ("stream", "peer", "updates/s", "ratio"))
     for row in rows:
         ratio = "" if row["peer"] == OURS else f"{row['ratio']:.1f}"
-        speed = f"{row['updates_per_second']:,.0f}"
-        table.add_row(row["stream"], row["peer"], speed, ratio, f"{row['rmse']:.3f}", f"{row['nlpd']:.3f}")
+        table.add_row(row["stream"], row["peer"], f"{row['updates_per_second']:,.0f}", ratio)
+    return table
+
+
+def _accuracy_table(rows: Rows) -> Table:
+    title = f"Errors on held-out data, mean of {rows[0]['seeds']} draws"
+    table = _table(title, ("stream", "peer", "points", "RMSE", "NLPD"))
+    for row in rows:
+        errors = (f"{row[name]:.4f}" for name in ("rmse", "nlpd"))
+        table.add_row(row["stream"], row["peer"], f"{row['points']:,}", *errors)
     return table
 
 

@@ -118,7 +118,7 @@ def near_duplicates(points: int, seed: int = 0) -> Stream:
     return _standardised(inputs, targets, points, lengthscale=1.0, noise_variance=0.01)
 
 
-STREAMS: dict[str, Callable[[int], Stream]] = {
+STREAMS: dict[str, Callable[..., Stream]] = {
     "pendulum": pendulum,
     "every point novel": novel,
     "cheetah-like": cheetah,

@@ -18,6 +18,7 @@ TINY = gp_updates.Effort(
     rounds=1,
     points=200,
     common=64,
+    seeds=1,
     patience=60.0,
     budgets=(10, 40),
     blocks=(1, 32),
@@ -141,7 +142,9 @@ def test_a_whole_run_prints_every_table_and_writes_json_and_a_picture(tmp_path, 
     assert results["machine"]["threads"] == 1
     assert len(results["streams"]) == len(STREAMS) * len(PEERS)
     assert {row["peer"] for row in results["block"]} == set(PEERS)
+    errors = {(row["peer"], row["points"]): row["rmse"] for row in results["accuracy"]}
+    assert errors[OURS, 200] < errors[OURS, 64] < 2
     assert all(0 < row["fraction"] < 2 for row in results["settled"])
     assert set(results["exponents"]) == set(gp_report.VARIABLES)
-    for heading in ("Budget 40", "matrix product", "over all learners", "Mean and variance"):
+    for heading in ("Budget 40", "held-out", "matrix product", "over all learners", "Mean and variance"):
         assert heading in printed.getvalue()

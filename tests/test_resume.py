@@ -1,9 +1,11 @@
 """Resuming: a run that was killed anywhere and resumed leaves the metrics of one that was not."""
 
+import multiprocessing
 import os
 import random
 import resource
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -34,31 +36,29 @@ OTHERS = [
 COMMON = "--learners 2 --num-envs 2 --logger csv --checkpoint-interval"
 
 
-def in_a_process(arguments: list[str], longest_file: int | None = None) -> int:
-    """Start the command line in a fork, which needs no new imports; returns its process id."""
-    child = os.fork()
-    if child == 0:
-        os.setsid()
-        code = 70
-        try:
-            if longest_file is not None:
-                resource.setrlimit(resource.RLIMIT_FSIZE, (longest_file, resource.RLIM_INFINITY))
-            for stream in (1, 2):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
-            code = train.main(arguments)
-        finally:
-            os._exit(code)
-    return child
+# Forked from a process that has imported everything and runs no threads, which a fork of this one would hang on.
+SERVER = multiprocessing.get_context("forkserver")
+SERVER.set_forkserver_preload(["train"])
+
+
+def trained(arguments: list[str], longest_file: int | None) -> None:
+    """The command line without evaluation and pictures, which take longer, in silence."""
+    if longest_file is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (longest_file, resource.RLIM_INFINITY))
+    for stream in (1, 2):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+    train.conclude = lambda *finished: None
+    sys.exit(train.main(arguments))
 
 
 def run(arguments: list[str], kill_after: float | None = None, longest_file: int | None = None) -> int | None:
     """The exit code, or None if the run was killed after some seconds."""
-    child = in_a_process(arguments, longest_file)
-    if kill_after is not None:
-        time.sleep(kill_after)
-        os.kill(child, signal.SIGKILL)
-    _, status = os.waitpid(child, 0)
-    return None if os.WIFSIGNALED(status) else os.waitstatus_to_exitcode(status)
+    process = SERVER.Process(target=trained, args=(arguments, longest_file))
+    process.start()
+    process.join(kill_after)
+    process.kill()
+    process.join()
+    return None if process.exitcode == -signal.SIGKILL else process.exitcode
 
 
 @pytest.fixture(
@@ -68,11 +68,10 @@ def undisturbed(request, tmp_path_factory):
     """Name and options of a run, its metrics, and how long it took."""
     folder = tmp_path_factory.mktemp("undisturbed") / "run"
     arguments = [*request.param.split(), *COMMON.split()]
+    assert run(["tasks"]) == 0  # the server has started
     started = time.monotonic()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train, "conclude", lambda *finished: None)  # evaluation and pictures take longer
-        assert run([*arguments, "1000", "--out", str(folder)]) == 0
-        yield arguments, (folder / "metrics.csv").read_bytes(), time.monotonic() - started
+    assert run([*arguments, "1000", "--out", str(folder)]) == 0
+    return arguments, (folder / "metrics.csv").read_bytes(), time.monotonic() - started
 
 
 def resumed_metrics(arguments: list[str], folder: Path, moments: list[float]) -> bytes:

@@ -63,7 +63,7 @@ def test_one_point_is_read_from_the_present_kernel_state_and_precision():
     gp, other = (SparseOnlineGP(SquaredExponential(2, 0.5), 20, 0.05).requires_grad_(False) for _ in "ab")
     gp.update(inputs, inputs.sum(-1))
     before = gp(one)
-    gp.kernel.lengthscale = 1.5  # pyright: ignore[reportArgumentType]
+    gp.kernel.lengthscale = 1.5
     torch.testing.assert_close(gp(one)[1], gp(inputs)[1][4:5])
     assert not torch.equal(gp(one)[1], before[1])
     other.load_state_dict(gp.state_dict())

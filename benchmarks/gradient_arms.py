@@ -9,7 +9,7 @@ from jaxtyping import Float
 from tensordict import TensorDict
 from torch import Tensor
 
-from benchmarks.gradient_data import STEPS, Batches
+from benchmarks.gradient_data import EPISODES, STEPS, Batches
 from torch_gprl.critics import (
     ESTIMATORS,
     USE_ALL_ACTIONS,
@@ -30,9 +30,10 @@ class Arm:
     """An estimator, and the critic behind it.
 
     Critics are "none", "neural", and Gaussian processes: "returns" and "differences" learned one earlier
-    batch, "replay" the differences of several, and "pooled" those of so many that next to nothing is unknown.
-    What the last one leaves is the noise of the few states in a batch, which no critic can help; averages
-    over all actions at all `remembered` states, those of the earlier batches too, have less of it.
+    batch, those of `REPLAYED` solved the differences of several, and "pooled" those of so many that next to
+    nothing is unknown. What the last one leaves is the noise of the few states in a batch, which no critic
+    can help; averages over all actions at all `remembered` states, those of the earlier batches too, have
+    less of it.
     """
 
     label: str
@@ -62,15 +63,18 @@ ARMS = (
     Arm("GPTD, k = 1, minus V", "differences", "k-step-baseline", 1),
     Arm("GPTD advantage", "differences", "advantage"),
     Arm("GPTD all-action", "differences", "all-action"),
-    Arm("GPTD GAE, λ = 0.8, replay", "replay", "generalised", trace=0.8),
-    Arm("GPTD all-action, replay", "replay", "all-action"),
-    Arm("the same, remembered states", "replay", "all-action", remembered=True),
+    Arm("GPTD GAE, λ = 0.8, replay", "five", "generalised", trace=0.8),
+    Arm("GPTD all-action, replay", "five", "all-action"),
+    Arm("5 batches, remembered states", "five", "all-action", remembered=True),
+    Arm("10 batches, remembered states", "ten", "all-action", remembered=True),
+    Arm("20 batches, remembered states", "twenty", "all-action", remembered=True),
     Arm("all-action, best critic", "pooled", "all-action"),
 )
-REPLAYED, POOLED = 5, 40  # batches
-GAUSSIAN = ("returns", "differences", "replay", "pooled")  # processes as critics
+REPLAYED = {"five": 5, "ten": 10, "twenty": 20}  # batches, by the critic that solves their differences
+POOLED = 40  # batches
+GAUSSIAN = ("returns", "differences", *REPLAYED, "pooled")  # processes as critics
 AT_ONCE = {"targets": "differences", "lengthscale": 0.5, "noise": 0.001}  # where all differences are solved
-POOLED_BUDGET = 600
+STEPS_PER_BASIS_VECTOR, LARGEST_BASIS = 5, 1_000  # where all differences are solved
 
 
 class Critics(NamedTuple):
@@ -83,13 +87,22 @@ class Critics(NamedTuple):
 def fit_critics(
     earlier: Batches, several: Batches, pooled: GPActionValue, numbers: PolicyGradientConfig
 ) -> Critics:
-    """All critics: fitted on one earlier batch for each learner, on several, and the one that serves all."""
+    """All critics: fitted on one earlier batch for each learner, on several, and the one that serves all.
+
+    Args:
+        earlier: one batch for each learner.
+        several: as many as the largest of `REPLAYED` for each learner.
+        pooled: critic of very many batches.
+        numbers: of the critics that learn one batch.
+    """
     gaussian = {
         "returns": fit_gaussian(earlier, numbers),
         "differences": fit_gaussian(earlier, dataclasses.replace(numbers, targets="differences")),
-        "replay": fit_gaussian(several, at_once(several, numbers)),
-        "pooled": pooled,
     }
+    for name, count in REPLAYED.items():
+        replayed = first(several, count)
+        gaussian[name] = fit_gaussian(replayed, at_once(replayed, numbers))
+    gaussian["pooled"] = pooled
     return Critics(gaussian, fit_neural(earlier, numbers))
 
 
@@ -105,7 +118,7 @@ def fit_neural(earlier: Batches, numbers: PolicyGradientConfig) -> NeuralValue:
 
 def fit_pooled(batch: Batches, numbers: PolicyGradientConfig, learners: int) -> GPActionValue:
     """One critic that has learned a very large batch of one learner, repeated for all learners."""
-    config = at_once(batch, dataclasses.replace(numbers, budget=POOLED_BUDGET))
+    config = at_once(batch, numbers)
     one = fit_gaussian(batch, config)
     critic = make_critic(batch.policy, config, learners)
     own = critic.state_dict()
@@ -113,9 +126,17 @@ def fit_pooled(batch: Batches, numbers: PolicyGradientConfig, learners: int) -> 
     return critic.requires_grad_(False)
 
 
+def first(several: Batches, count: int) -> Batches:
+    """So many of each learner's batches."""
+    kept = slice(count * EPISODES)
+    return Batches(several.data[:, kept], several.true_return[:, kept], several.policy)
+
+
 def at_once(earlier: Batches, numbers: PolicyGradientConfig) -> PolicyGradientConfig:
-    """Numbers of a critic that remembers all these batches."""
-    return dataclasses.replace(numbers, replay=earlier.data[0].numel(), **AT_ONCE)
+    """Numbers of a critic that solves all differences of these batches, on a basis that grows with them."""
+    steps = earlier.data[0].numel()
+    budget = min(LARGEST_BASIS, max(1, steps // STEPS_PER_BASIS_VECTOR))
+    return dataclasses.replace(numbers, replay=steps, solved=steps, budget=budget, **AT_ONCE)
 
 
 def fit_gaussian(earlier: Batches, config: PolicyGradientConfig) -> GPActionValue:
@@ -148,7 +169,7 @@ def gradients(
     critic = critics.gaussian[arm.critic] if arm.estimator in USE_ALL_ACTIONS else None
     if not arm.remembered:
         return ascent(new.data, new.policy, weight, critic)
-    both = TensorDict.cat([several.data, new.data], 1)
+    both = TensorDict.cat([first(several, REPLAYED[arm.critic]).data, new.data], 1)
     assert isinstance(both, TensorDict)
     return ascent(both, new.policy, weight.new_zeros(both.shape), critic)
 

@@ -3,8 +3,8 @@
     python -m benchmarks.gradient_quality [--quick] [--batches 200] [--task Pendulum-v1]
 
 At fixed policies, every estimator sees the same independent batches of 5 episodes of 200 steps; its critic
-was fitted on one earlier batch, or on five ("replay"). The reference is the mean over many more batches of an
-unbiased estimator on true returns. A command that was stopped goes on where it stood.
+was fitted on one earlier batch, or on several ("replay", "remembered"). The reference is the mean over many
+more batches of an unbiased estimator on true returns. A command that was stopped goes on where it stood.
 Leaves gradient_quality.json and gradient_quality.png in --out.
 """
 
@@ -58,7 +58,7 @@ class Options:
     batches: int = 200  # independent batches of every policy
     reference_batches: int = 800  # further ones, for the reference gradient
     task: str | None = None  # one task instead of all
-    budget: int = 300  # basis vectors of the critics
+    budget: int = 300  # basis vectors of the critics that learn one batch
     out: Path = field(default_factory=lambda: Path("runs/gradient-quality"))  # where results and policies go
 
 
@@ -140,7 +140,7 @@ class Sides:
 
     Args:
         fixed: the policy.
-        budget: basis vectors of the critics.
+        budget: basis vectors of the critics that learn one batch.
     """
 
     def __init__(self, fixed: Fixed, budget: int) -> None:
@@ -160,7 +160,7 @@ class Sides:
     def estimates(self, seed: int) -> dict[str, Tensor]:
         """Every arm's gradient for each batch; each critic's correlation with the true advantages."""
         earlier = batches(self.fixed, SIDE_BY_SIDE, seed)
-        several = batches(self.fixed, SIDE_BY_SIDE, seed + 2, REPLAYED * EPISODES)
+        several = batches(self.fixed, SIDE_BY_SIDE, seed + 2, max(REPLAYED.values()) * EPISODES)
         critics = fit_critics(earlier, several, self.pooled, self.numbers)
         new = batches(self.fixed, SIDE_BY_SIDE, seed + 1)
         seen = evaluations(new, critics, self.discount)

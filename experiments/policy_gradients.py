@@ -29,8 +29,8 @@ from torch_gprl.runs import MetricsWriter, bootstrap_interval, read_metrics, sav
 
 Metrics = dict[str, Float[np.ndarray, "updates L"]]
 
-# All experience solved at once, under today's policy.
-AT_ONCE = {"targets": "differences", "replay": 4_000, "noise": 0.001, "lengthscale": 0.5}
+# All experience solved at once, under today's policy, on a basis vector for every five steps.
+AT_ONCE = {"targets": "differences", "replay": 4_000, "budget": 800, "noise": 0.001, "lengthscale": 0.5}
 # The arms that matter most come first.
 CLAIM_1: dict[str, dict[str, Any]] = {
     "REINFORCE": {"estimator": "return", "targets": "returns"},
@@ -52,7 +52,7 @@ CLAIM_2: dict[str, dict[str, Any]] = {
     "estimated anew": PERSISTENT | {"renew_every": 1},
     "kept, λ = 0.0": PERSISTENT,
     "kept, solved anew": PERSISTENT | AT_ONCE,
-    "newest rollout, solved at once": PERSISTENT | AT_ONCE | {"replay": 1_000},
+    "newest rollout alone, solved at once": PERSISTENT | AT_ONCE | {"replay": 1_000},
     **{f"kept, λ = {weight}": PERSISTENT | {"age_weight": weight} for weight in (0.5, 1.0, 0.25, 0.75)},
 }
 PANELS = {

@@ -16,7 +16,7 @@ from torch_gprl.linalg import cholesky
 
 
 class SparseRegression:
-    """Posterior of T functions at once; without gradients.
+    """Posterior of T functions at once; means are differentiable in the inputs, all else has no gradients.
 
     Args:
         kernel: prior covariance of each of the functions.
@@ -43,7 +43,6 @@ class SparseRegression:
     def _features(self, inputs: Tensor) -> Tensor:
         return torch.linalg.solve_triangular(self._gram_factor, self._against(inputs), upper=False)
 
-    @torch.no_grad()
     def mean(self, inputs: Float[Tensor, "*batch N D"]) -> Float[Tensor, "*batch N T"]:
         """Posterior means at inputs [*batch, N, D]."""
         return self._against(inputs).mT @ self.coefficients

@@ -189,6 +189,11 @@ class Sum(_Composite):
         """Covariance of x [*batch, N, D] with z [*batch, M, D]: [*batch, N, M]."""
         return reduce(add, (kernel(x, z) for kernel in self.parts))
 
+    def against(self, z: OtherInputs) -> Callable[[Inputs], CrossMatrix]:
+        """The function x ↦ k(z, x), with what each part computes beforehand; see `Kernel.against`."""
+        parts = [kernel.against(z) for kernel in self.parts]
+        return lambda x: reduce(add, (part(x) for part in parts))
+
     def diag(self, x: Inputs) -> PerPoint:
         """Prior variance at x [*batch, N, D]: [*batch, N]."""
         return reduce(add, (kernel.diag(x) for kernel in self.parts))

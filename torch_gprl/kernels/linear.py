@@ -4,7 +4,7 @@ Rasmussen and Williams (2006), section 4.2.2: b + wᵀx with b ~ N(0, σ_b²), w
 σ_b² + Σ_d σ_d² x_d z_d.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from torch import Tensor
 
@@ -43,6 +43,12 @@ class Linear(Kernel):
         """Covariance of x [*batch, N, D] with z [*batch, M, D]: [*batch, N, M]."""
         slope_variance = self.slope_variance.unsqueeze(-2)
         return x.to(slope_variance.dtype) @ (z * slope_variance).mT + self.bias_variance[..., None, None]
+
+    def against(self, z: OtherInputs) -> Callable[[Inputs], CrossMatrix]:
+        """The function x ↦ k(z, x): one matrix product; see `Kernel.against`."""
+        weighted = (z * self.slope_variance.unsqueeze(-2)).detach()
+        bias = self.bias_variance[..., None, None].detach()
+        return lambda x: weighted @ x.to(weighted.dtype).mT + bias
 
     def diag(self, x: Inputs) -> PerPoint:
         """Prior variance at x [*batch, N, D]: [*batch, N]."""

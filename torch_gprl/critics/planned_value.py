@@ -60,7 +60,7 @@ class Planning:
     sweeps: int = 40  # of value iteration, in each plan
     backup_actions: int = 9  # actions compared in a sweep
     lengthscale: float = 2.0  # of values, in the observations' standard deviations times √columns
-    novelty_lengthscale: float = 0.5  # in which a state counts as new, likewise
+    novelty_lengthscale: float = 1.0  # in which a state counts as new, likewise
     tremble: float = 0.25  # standard deviation of actions that is planned for, in halves of their range
     optimism: float = 1.0  # the unknown is hoped to hold the best seen, and so many attainable ranges more
     hold: int = 2  # environment steps that an action is held for

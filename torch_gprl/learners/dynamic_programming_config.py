@@ -41,7 +41,7 @@ class DynamicProgrammingConfig(PlannedBehaviour):
     backup_actions: int = 9  # actions compared in a sweep
     acting_actions: int = 21  # actions compared when acting
     lengthscale: float = 2.0  # of values, in standard deviations of the observations times √columns
-    novelty_lengthscale: float = 0.5  # in which a state counts as new, likewise
+    novelty_lengthscale: float = 1.0  # in which a state counts as new, likewise
     tremble: float = 0.25  # standard deviation of actions to plan for, in halves of the actuator's range
     hold: int = 2  # environment steps that a plan holds an action for; acting chooses anew at every step
     smoothness: float = 0.5  # of values, as in Matérn kernels: 0.5, 1.5 or 2.5

@@ -51,7 +51,7 @@ class PlannedBehaviour:
     least_std: float = 0.05  # confidence: floor of σ, in halves of the actuator's range
     most_std: float = 1.0  # confidence: ceiling of σ, in halves of the actuator's range
     gibbs_form: EnergyForm = "robust"  # gibbs: the thesis' energy, or its sibling that stays near f(s)
-    inverse_temperature: float = 10.0  # gibbs: β at first, for values scaled by their range over the actions
+    inverse_temperature: float = 30.0  # gibbs: β at first, for values scaled by their range over the actions
     final_inverse_temperature: float = 100.0  # gibbs: β at last; it grows by equal factors
     gibbs_width: float = 2.0  # gibbs: σ_e, in halves of the range; as wide as all of it
 

@@ -59,9 +59,10 @@ PANELS = {
     "return": "return per episode",
     "gradient_cosine": "cosine of gradients from two halves",
     "value_error": "RMSE of Q right after a policy update",
+    "explained_variance": "share of the variance of returns explained",
     "outdated": "share of basis vectors out of date",
 }
-SMOOTHED = 5  # updates
+SMOOTHED = 3  # updates
 
 
 @dataclass(frozen=True)
@@ -143,10 +144,11 @@ def summary(metric: Float[np.ndarray, "updates L"], key: str) -> tuple[float, fl
 
 
 def draw(curves: dict[str, Metrics], title: str) -> Figure:
-    """One panel for each metric, one line with its interval for each arm."""
-    figure = Figure(figsize=(11, 7.5), layout="constrained")
+    """One panel for each metric, one line with its interval for each arm; the last holds the legend."""
+    figure = Figure(figsize=(14, 7.5), layout="constrained")
     figure.suptitle(title)
-    for axes, (key, label) in zip(figure.subplots(2, 2).flat, PANELS.items(), strict=True):
+    *panels, legend = figure.subplots(2, 3).flat
+    for axes, (key, label) in zip(panels, PANELS.items(), strict=True):
         for name, arm in curves.items():
             if key not in arm:
                 continue
@@ -158,7 +160,9 @@ def draw(curves: dict[str, Metrics], title: str) -> Figure:
         axes.set(xlabel="environment steps per learner", ylabel=label)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25, linewidth=0.5)
-    figure.axes[0].legend(frameon=False, fontsize="small")
+    panels[list(PANELS).index("explained_variance")].set_ylim(-0.5, 1)  # an early critic is far below
+    legend.axis("off")
+    legend.legend(*panels[0].get_legend_handles_labels(), frameon=False, loc="center left")
     return figure
 
 

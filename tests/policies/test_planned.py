@@ -21,6 +21,7 @@ SMALL = DynamicProgrammingConfig(
     sweeps=3,
     backup_actions=5,
     acting_actions=9,
+    novelty_lengthscale=0.5,
     trial=0,
 )
 LOW, HIGH = torch.tensor([-5.0], dtype=torch.float64), torch.tensor([5.0], dtype=torch.float64)

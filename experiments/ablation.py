@@ -22,7 +22,7 @@ from benchmarks.timing import machine
 
 ROWS: dict[str, dict[str, object]] = {
     "all parts": {},
-    "every new plan trusted": {"trial": 0},
+    "no rehearsal": {"rehearsal": 0},
     "actions held for one step": {"hold": 1},
     "actions held for three steps": {"hold": 3},
     "no imagined states": {"imagined": 0},

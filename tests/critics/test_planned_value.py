@@ -22,6 +22,8 @@ def walk(learners=2, steps=150, end=None, seed=0):
 
 
 def planned(data, **numbers):
+    """A plan; nothing is rehearsed unless told."""
+    numbers = {"rehearsal": 0} | numbers
     model = TransitionModel(len(data.reward), 1, 1, budget=100)
     model.solve(data, fit=True)
     value = PlannedValue(model, -BOUND, BOUND, Planning(**numbers), acting_actions=41)
@@ -181,31 +183,39 @@ def test_learners_plan_apart(learner):
     together = planned(data).best_action(grid(), explore=False)[learner]
     model = TransitionModel(1, 1, 1, budget=100)
     model.solve(alone, fit=True)
-    value = PlannedValue(model, -BOUND, BOUND, Planning(), acting_actions=41)
+    value = PlannedValue(model, -BOUND, BOUND, Planning(rehearsal=0), acting_actions=41)
     uniform = torch.rand(2, 100, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     value.plan(alone, uniform[learner : learner + 1])
     own = value.best_action(grid()[:1], explore=False)[0]
     torch.testing.assert_close(own, together, rtol=0, atol=0.06)  # ties between neighbours may fall apart
 
 
-@pytest.mark.parametrize(("trial", "kept"), [(30, True), (0, False)])
-def test_a_plan_that_earns_less_in_imagination_is_not_trusted(trial, kept):
+@pytest.mark.parametrize(("rehearsal", "kept"), [(30, True), (0, False)])
+def test_a_bad_plan_does_not_change_what_was_rehearsed_well(rehearsal, kept):
     data = walk()
-    value = planned(data, discount=0.9, sweeps=1, hold=1, trial=trial)
+    value = planned(data, discount=0.9, sweeps=1, hold=1, rehearsal=rehearsal)
     before = value.best_action(grid(), explore=False)
     state = value.state_dict()
-    state["last"]["weights"] = -5 * state["last"]["weights"]  # the next plan begins with the opposite
+    state["support"]["weights"] = -5 * state["support"]["weights"]  # the next plan begins with the opposite
     value.load_state_dict(state, data)
     value.plan(data, torch.zeros(2, 0, 1 + IMAGINED_STEPS, dtype=torch.float64))
-    assert torch.equal(value.best_action(grid(), explore=False), before) == kept
+    after = value.best_action(grid(), explore=False)
+    assert bool(((after - before).abs() < 0.5).all()) == kept
 
 
-def test_a_plan_that_earns_more_in_imagination_takes_over():
+def test_a_plan_that_earns_more_than_what_was_rehearsed_takes_over():
     data = walk()
-    value = planned(data, discount=0.9)
+    value = planned(data, discount=0.9, rehearsal=30)
     before = value.best_action(grid(), explore=False)
     state = value.state_dict()
-    state["trusted"]["weights"] = -5 * state["trusted"]["weights"]
+    state["rehearsed"]["weights"] = -state["rehearsed"]["weights"]
     value.load_state_dict(state, data)
     value.plan(data, torch.zeros(2, 0, 1 + IMAGINED_STEPS, dtype=torch.float64))
     torch.testing.assert_close(value.best_action(grid(), explore=False), before, rtol=0, atol=0.3)
+
+
+def test_exploring_does_not_follow_what_was_rehearsed():
+    data = walk()
+    value, plan = planned(data, discount=0.9, rehearsal=5), planned(data, discount=0.9)
+    assert torch.equal(value.best_action(grid(), explore=True), plan.best_action(grid(), explore=True))
+    assert not torch.equal(value.best_action(grid(), explore=False), plan.best_action(grid(), explore=False))

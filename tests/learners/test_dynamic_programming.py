@@ -17,7 +17,8 @@ SMALL = DynamicProgrammingConfig(
     sweeps=5,
     backup_actions=5,
     acting_actions=9,
-    trial=5,
+    rehearsal=5,
+    ascents=2,
 )
 
 

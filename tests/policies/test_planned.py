@@ -22,7 +22,7 @@ SMALL = DynamicProgrammingConfig(
     backup_actions=5,
     acting_actions=9,
     novelty_lengthscale=0.5,
-    trial=0,
+    rehearsal=0,
 )
 LOW, HIGH = torch.tensor([-5.0], dtype=torch.float64), torch.tensor([5.0], dtype=torch.float64)
 

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 
@@ -25,25 +24,3 @@ class Course(NamedTuple):
     reward: Tensor  # [L, N] in all, discounted
     lasting: Tensor  # [L, N] the chance, 0 to 1, that the task goes on
     doubt: Tensor  # [L, N] about the first step, as `Prediction`
-
-
-def take(new: Support, old: Support, better: Tensor) -> Support:
-    """The new plan for the learners [L] where it is better, the old one for the others."""
-    return Support(
-        *(
-            torch.where(better.view(-1, *[1] * (ours.ndim - 1)), ours, theirs)
-            for ours, theirs in zip(new, old, strict=True)
-        )
-    )
-
-
-def with_places(plan: Support, places: int, nowhere: float) -> Support:
-    """The plan with so many places for ends; what it has not filled lies `nowhere`, far from all states."""
-    more = places - plan.ends.shape[1]
-
-    def filled(values: Tensor, number: float) -> Tensor:
-        return torch.cat([values, values.new_full((len(values), more, *values.shape[2:]), number)], 1)
-
-    return plan._replace(
-        scaled=filled(plan.scaled, nowhere), ends=filled(plan.ends, 0.0), weights=filled(plan.weights, 0.0)
-    )

@@ -17,9 +17,9 @@ that were met, whose value is zero: what an end pays belongs to the step that le
 The maximum is taken over averages of nearby actions, as if the hand trembled. Where many actions serve
 equally well, up to an edge beyond which none does, this keeps away from the edge.
 
-A new plan must stand a trial in imagination: only where it earns no less than the plan that is trusted, from
-states of the experience on and with the value of where it gets to, is it acted on when nothing is explored.
-Plans differ by their support, and one in several drops a pole that the last one held.
+What is performed when nothing is explored is a smooth policy that begins with the plan's best actions, or
+with what was performed so far, and is rehearsed in imagination (`rehearsal`): the best actions err where many
+are worth nearly the same, and are others after every plan.
 
 A second value, for exploration, takes what the model does not know for better than all that was seen
 (optimism in the face of uncertainty): a share of each backup, as large as the doubt, is the highest hope.
@@ -33,9 +33,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_gprl.critics.ends import NOWHERE, Ends
+from torch_gprl.critics.ends import Ends
 from torch_gprl.critics.maximise import candidate_actions
-from torch_gprl.critics.plan import Course, Support, take, with_places
+from torch_gprl.critics.plan import Course, Support
+from torch_gprl.critics.rehearsal import SmoothPolicy, Walks, rehearse
 from torch_gprl.critics.transition_model import Prediction, TransitionModel, Transitions
 from torch_gprl.gp import Posterior
 from torch_gprl.graphs import farthest_points
@@ -46,7 +47,7 @@ EXPLOIT, EXPLORE = 0, 1  # columns of the values
 VALUE_NOISE, NOVELTY_NOISE = 1e-3, 1e-2  # of regressions under kernels of variance 1
 IMAGINED_STEPS = 2  # from a known state to an imagined one
 FIRST_SWEEPS = 3  # times as many as later: those begin from the last value
-TRIALS = 6  # states of the experience that plans are tried from
+WALKS = 24  # imagined walks of a rehearsal, from states of the experience on
 CHUNK = 2**22  # numbers of the largest temporary: bounds the memory
 
 
@@ -65,7 +66,8 @@ class Planning:
     optimism: float = 1.0  # the unknown is hoped to hold the best seen, and so many attainable ranges more
     hold: int = 2  # environment steps that an action is held for
     smoothness: float = 0.5  # of values, as in Matérn kernels: 0.5, 1.5 or 2.5
-    trial: int = 60  # imagined steps in which a new plan must earn no less than the last; 0: no trial
+    rehearsal: int = 60  # steps of the imagined walks that improve what is performed; 0: perform the plan
+    ascents: int = 10  # gradient steps of a rehearsal
 
 
 class PlannedValue:
@@ -89,8 +91,8 @@ class PlannedValue:
         self._centre, self._half = (low + high) / 2, (high - low) / 2
         self._backup_actions = self._candidates(low, high, planning.backup_actions)
         self.acting_actions = self._candidates(low, high, acting_actions)
-        self._support: Support | None = None  # of the last plan: it explores
-        self._trusted: Support | None = None  # of the best plan: it exploits
+        self._support: Support | None = None  # of the plan
+        self._rehearsed: SmoothPolicy | None = None  # what is performed, if anything is rehearsed
 
     def _candidates(self, low: Tensor, high: Tensor, count: int) -> Tensor:
         return (candidate_actions(low, high, count) - self._centre) / self._half
@@ -127,34 +129,33 @@ class PlannedValue:
         loc, scale = self.model.loc, self.model.scale
         self._support = Support(observation, scaled, self._ends.labels, loc, scale, prior, none)
         self._iterate(values, self.planning.sweeps * (1 if before is not None else FIRST_SWEEPS))
-        self._trust(data)
+        if self.planning.rehearsal:
+            self._rehearsed = self._rehearse(data)
 
-    def _trust(self, data: Transitions) -> None:
-        """Replace the trusted plan where the new one is no worse."""
-        new, old = self._support, self._trusted
-        assert new is not None
-        alike = (
-            old is not None and old.observation.shape == new.observation.shape
-        )  # few states to choose from
-        if old is None or not alike or not self.planning.trial:
-            self._trusted = new
-            return
-        old = with_places(old, new.ends.shape[1], NOWHERE)  # some learner may have met the first end
-        steps = data.reward.shape[1]
-        spread = torch.linspace(0, steps - 1, min(TRIALS, steps), device=data.reward.device).long()
-        states = data.observation[:, spread]
-        self._trusted = take(new, old, self._tried(new, states) >= self._tried(old, states))
+    def _rehearse(self, data: Transitions) -> SmoothPolicy:
+        """Improve what is performed, by the model and with the plan's value of where walks get to."""
+        support, last, visited = self._support, self._rehearsed, data.observation
+        assert support is not None
 
-    def _tried(self, plan: Support, states: Float[Tensor, "L N S"]) -> Float[Tensor, " L"]:
-        """What a plan earns from these states on by the model, with the last plan's value of the end."""
-        assert self._support is not None
-        going, earned = torch.ones_like(states[..., 0]), torch.zeros_like(states[:, 0, 0])
-        for _ in range(self.planning.trial):
-            values = self._candidate_values(plan, self._backup_actions, states, explore=False)
-            step, end = self._step(states, self._backup_actions[values.argmax(-1)], doubt=False)
-            earned = earned + (going * step.reward).sum(1)
-            going, states = going * (end < 0.5), step.observation
-        return earned + (going * self._values_of(self._support, states)[..., EXPLOIT]).sum(1)
+        def among(count: int) -> Tensor:
+            spread = torch.linspace(0, visited.shape[1] - 1, min(count, visited.shape[1])).long()
+            return visited[:, spread.to(visited.device)]
+
+        def step(states: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            step, end = self._step(states, actions, doubt=False)
+            return step.observation, step.reward, end
+
+        def value(states: Tensor) -> Tensor:
+            return self._values_of(support, states)[..., EXPLOIT]
+
+        pool = torch.cat([support.observation, among(self.planning.support)], 1)
+        chosen = farthest_points(self._scaled(pool), self.planning.support).chosen
+        states = pool.take_along_dim(chosen.unsqueeze(-1), 1)
+        greedy = self.acting_actions[self.candidate_values(states, explore=False).argmax(-1)]
+        choices = [greedy] if last is None else [last(states), greedy]
+        walks = Walks(step, value, among(WALKS), self.planning.rehearsal, self.planning.discount)
+        policy = SmoothPolicy(states, support.loc, support.scale)
+        return rehearse(walks, policy, choices, self.planning.ascents)
 
     def _kernels(self, like: Tensor) -> tuple[Kernel, Kernel]:
         """Of values and of novelty, in scaled coordinates, where the length scale of values is 1."""
@@ -291,14 +292,8 @@ class PlannedValue:
         self, observation: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"], explore: bool
     ) -> Float[Tensor, "L N"]:
         """r̂ + γ V(ŝ') of actions in halves of the actuator's range, each held for `Planning.hold` steps."""
-        return self._action_values(self._acted_on(explore), observation, action, explore)
-
-    def _acted_on(self, explore: bool) -> Support:
-        support = self._support if explore else self._trusted
+        support = self._support
         assert support is not None
-        return support
-
-    def _action_values(self, support: Support, observation: Tensor, action: Tensor, explore: bool) -> Tensor:
         course = self._course(observation, action, doubt=explore)
         after = self._values_of(support, course.observation)[..., EXPLORE if explore else EXPLOIT]
         value = course.reward + self._beyond * course.lasting * after
@@ -307,27 +302,26 @@ class PlannedValue:
         return torch.lerp(value, self._hope.expand_as(value), self._unknown(course)[..., EXPLORE])
 
     def best_action(self, observation: Float[Tensor, "L N S"], explore: bool) -> Float[Tensor, "L N A"]:
-        """The best of the candidate actions, in halves of the actuator's range."""
+        """What to do, in halves of the actuator's range: the best candidate, or what is rehearsed."""
+        if self._rehearsed is not None and not explore:
+            return self._rehearsed(observation)
         return self.acting_actions[self.candidate_values(observation, explore).argmax(-1)]
 
     @torch.no_grad()
     def candidate_values(self, observation: Float[Tensor, "L N S"], explore: bool) -> Float[Tensor, "L N J"]:
         """The values of all candidate actions, each averaged over actions near it."""
-        return self._candidate_values(self._acted_on(explore), self.acting_actions, observation, explore)
-
-    def _candidate_values(
-        self, support: Support, actions: Tensor, observation: Tensor, explore: bool
-    ) -> Float[Tensor, "L N J"]:
+        actions = self.acting_actions
         trembling = self._trembling(actions)
         each = len(observation) * len(actions) * (self.model.budget + self.planning.support)
         values = []
         for some in observation.split(max(1, CHUNK // each), 1):
             spread = some.repeat_interleave(len(actions), 1)
             tried = actions.repeat(some.shape[1], 1).expand(len(some), -1, -1)
-            value = self._action_values(support, spread, tried, explore)
+            value = self.action_values(spread, tried, explore)
             values.append(value.unflatten(1, (some.shape[1], -1)) @ trembling.mT)
         return torch.cat(values, 1)
 
+    @torch.no_grad()
     def reward(
         self, observation: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"]
     ) -> Float[Tensor, "L N"]:
@@ -339,6 +333,7 @@ class PlannedValue:
         """
         return self._step(observation, action, doubt=False)[0].reward
 
+    @torch.no_grad()
     def unknown(
         self, observation: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"]
     ) -> Float[Tensor, "L N"]:
@@ -363,19 +358,23 @@ class PlannedValue:
 
     def basis_points(self, learner: int) -> Float[Tensor, "M S"]:
         """The support states of a learner, as observations."""
-        return self._acted_on(explore=False).observation[learner]
+        assert self._support is not None
+        return self._support.observation[learner]
 
     # ---------------------------------------------------------------- keeping
 
     def state_dict(self) -> dict[str, Any]:
-        """The plan; what judges states follows from the experience that was planned on."""
-        if self._support is None or self._trusted is None:
+        """The plan and what is performed; what judges states follows from the experience."""
+        if self._support is None:
             return {}
-        return {"last": self._support._asdict(), "trusted": self._trusted._asdict()}
+        plan = {"support": self._support._asdict()}
+        return plan if self._rehearsed is None else plan | {"rehearsed": self._rehearsed.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any], data: Transitions) -> None:
         """Take up what `state_dict` gave, with the experience that was planned on."""
         if state:
             self._judge(data, self._kernels(data.observation))
             self._bound(data)
-            self._support, self._trusted = Support(**state["last"]), Support(**state["trusted"])
+            self._support = Support(**state["support"])
+        if "rehearsed" in state:
+            self._rehearsed = SmoothPolicy.restored(state["rehearsed"])

@@ -174,9 +174,8 @@ class TransitionModel:
         """Standardised observations beside actions."""
         return torch.cat([(observation - self.loc) / self.scale, action], -1)
 
-    @torch.no_grad()
     def predict(self, observation: Tensor, action: Tensor, doubt: bool = True) -> Prediction:
-        """What steps lead to, within the range of what was seen.
+        """What steps lead to, within the range of what was seen; differentiable in both, but for the doubt.
 
         Args:
             observation: [L, N, S].

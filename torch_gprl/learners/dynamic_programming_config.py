@@ -17,7 +17,8 @@ LEAST = {
     "backup_actions": 3,
     "acting_actions": 3,
     "hold": 1,
-    "trial": 0,
+    "rehearsal": 0,
+    "ascents": 0,
     "optimism": 0,
     "growth": 0,
 }
@@ -45,7 +46,8 @@ class DynamicProgrammingConfig(PlannedBehaviour):
     tremble: float = 0.25  # standard deviation of actions to plan for, in halves of the actuator's range
     hold: int = 2  # environment steps that a plan holds an action for; acting chooses anew at every step
     smoothness: float = 0.5  # of values, as in Matérn kernels: 0.5, 1.5 or 2.5
-    trial: int = 60  # imagined steps in which a new plan must earn no less than the last; 0: no trial
+    rehearsal: int = 60  # steps of the imagined walks that improve what is performed; 0: perform the plan
+    ascents: int = 10  # gradient steps of a rehearsal
 
     optimism: float = 1.0  # exploring hopes for the best seen and so many ranges of value more
 

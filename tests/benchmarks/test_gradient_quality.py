@@ -6,7 +6,16 @@ import pytest
 import torch
 
 import envs
-from benchmarks.gradient_arms import ARMS, evaluations, fit_critics, fit_pooled, gradients, quality
+from benchmarks.gradient_arms import (
+    ARMS,
+    at_once,
+    evaluations,
+    first,
+    fit_critics,
+    fit_pooled,
+    gradients,
+    quality,
+)
 from benchmarks.gradient_data import EPISODES, SETTINGS, STEPS, Batches, Fixed, batches
 from benchmarks.gradient_truth import ACTIONS, STATES, Branches, branches
 from torch_gprl.critics import EstimatorName, GPActionValue
@@ -74,6 +83,17 @@ def test_every_arm_gives_a_gradient_for_every_batch(made):
         found = gradients(arm, new, earlier, critics, seen)
         assert found.shape[0] == LEARNERS
         assert (found.norm(dim=1) > 0).all()
+
+
+def test_a_critic_that_replays_solves_every_step_on_a_basis_that_grows_with_them(made):
+    batch = made[0]
+    data, returns = torch.cat([batch.data] * 3, 1), torch.cat([batch.true_return] * 3, 1)
+    several = Batches(data, returns, batch.policy)
+    for count in (1, 2):
+        kept = first(several, count)
+        torch.testing.assert_close(kept.data["action"], torch.cat([batch.data["action"]] * count, 1))
+        numbers = at_once(kept, NUMBERS)
+        assert numbers.solved == numbers.replay == 5 * numbers.budget == count * EPISODES * STEPS
 
 
 def test_arms_cover_every_estimator_and_are_told_apart():

@@ -1,39 +1,35 @@
-"""Do critics on a graph of experience know which actions are better? Correlation with true advantages.
+"""How much experience does a critic need to know which actions are better, with a graph of it and without?
 
-    python -m benchmarks.graph_advantages [--batches 4] [--out runs/graph-advantages]
+    python -m benchmarks.graph_advantages [--batches 4] [--minutes 8] [--out runs/graph-advantages]
 
-At the fixed policies of `gradient_quality` on Pendulum-v1, critics learn one batch of 5 episodes, from
-returns or from temporal differences; then their advantages are compared with those of brute force. The last
-one stands on a graph of states and actions: it follows what an action leads to, where the others multiply a
-kernel of states by one of actions.
-Leaves graph_advantages.json in --out.
+At the fixed policies of `gradient_quality` on Pendulum-v1, critics learn batches of some episodes by temporal
+differences, as the learner of policy gradients does; then their advantages are compared with those of brute
+force. Correlations are appended to advantages.jsonl in --out; the same command goes on where it was stopped,
+and then leaves graph_advantages.json and a picture.
 """
 
+import dataclasses
 import json
-from collections.abc import Iterator
+import math
+import statistics
+import time
 from dataclasses import dataclass, field
-from itertools import product
 from pathlib import Path
 
 import torch
 import tyro
-from torch import Tensor
+from matplotlib.figure import Figure
 
 from benchmarks.gradient_arms import fit_gaussian
-from benchmarks.gradient_data import EPISODES, SETTINGS, Batches, Fixed, batches, fixed_policies
+from benchmarks.gradient_data import SETTINGS, STEPS, Batches, Fixed, batches, fixed_policies
 from benchmarks.gradient_truth import Branches, branches
-from torch_gprl.critics import KernelName, correlation
-from torch_gprl.gp import SparseOnlineGP
-from torch_gprl.graphs import Experience
-from torch_gprl.kernels import SuccessorWithRest
+from torch_gprl.critics import KernelName
 from torch_gprl.learners import PolicyGradientConfig
-from torch_gprl.learners.config import Targets
 
-KERNELS: tuple[KernelName, ...] = ("squared-exponential", "matern-3/2", "geodesic", "successor")
-TARGETS: tuple[Targets, ...] = ("returns", "differences")
-BRANCHES_SEED = 3_000_000
+KERNELS: tuple[KernelName, ...] = ("squared-exponential", "matern-3/2", "successor", "successor-actions")
+BRANCHES_SEED, DATA_SEED = 3_000_000, 7
+LENGTHSCALE = 0.5  # of observations, in their standard deviations times √columns
 NOISE = 1e-2  # of the variance of rewards
-VALUES_VARY_OVER = (1.0, 4.0)  # standard deviations of states, halves of the actuator's range
 
 
 @dataclass(frozen=True)
@@ -41,74 +37,100 @@ class Options:
     """What to compare."""
 
     batches: int = 4  # independent ones, each with critics of its own
-    episodes: int = EPISODES  # of each batch
-    budget: int = 200  # basis vectors
+    episodes: tuple[int, ...] = (5, 20, 50)  # of a batch
+    budgets: tuple[int, ...] = (200, 600)  # basis vectors
+    minutes: float = math.inf  # after which to stop, to go on by the same command
     out: Path = field(default_factory=lambda: Path("runs/graph-advantages"))  # where results and policies go
 
 
+@dataclass(frozen=True)
+class Case:
+    """A critic that learned so much; once judged, the correlation of its advantages in every batch."""
+
+    policy: str
+    kernel: KernelName
+    budget: int
+    episodes: int
+    correlation: tuple[float, ...] = ()
+
+
 def main(options: Options) -> None:
-    """Fit critics, print and leave their correlations."""
+    """Fit the critics that are missing, print and leave their correlations."""
     torch.set_num_threads(1)
-    setting, found = SETTINGS[0], {}
-    for fixed in fixed_policies(setting, options.out / "policies"):
+    options.out.mkdir(parents=True, exist_ok=True)
+    records, until = options.out / "advantages.jsonl", time.monotonic() + 60 * options.minutes
+    for fixed in fixed_policies(SETTINGS[0], options.out / "policies"):
+        complete(fixed, records, until, options)
+    found = read_cases(records)
+    lines = ",\n".join(json.dumps(dataclasses.asdict(case)) for case in found)
+    (options.out / "graph_advantages.json").write_text(f"[\n{lines}\n]\n")
+    draw(found, options.out / "graph_advantages.png")
+
+
+def complete(fixed: Fixed, records: Path, until: float, options: Options) -> None:
+    """Append what is missing of a policy, the least experience first."""
+    title = f"{fixed.name} policy (return {fixed.mean_return:.0f})"
+    done = {dataclasses.replace(case, correlation=()) for case in read_cases(records)}
+    for episodes in options.episodes:
+        missing = [
+            case
+            for budget in options.budgets
+            for kernel in KERNELS
+            if (case := Case(title, kernel, budget, episodes)) not in done
+        ]
+        if not missing or time.monotonic() > until:
+            continue
         truth = branches(fixed, BRANCHES_SEED)
-        seen = batches(fixed, options.batches, 7, options.episodes)
-        title = f"{fixed.name} policy (return {fixed.mean_return:.0f})"
-        found[title] = {}
-        for name, values in correlations(fixed, seen, truth, options):
-            found[title][name] = values.tolist()
-            print(f"{title}, {name}: {float(values.mean()):.2f} {[round(v, 2) for v in values.tolist()]}")
-    (options.out / "graph_advantages.json").write_text(json.dumps(found, indent=1) + "\n")
+        seen = batches(fixed, options.batches, DATA_SEED, episodes)
+        for case in missing:
+            if time.monotonic() > until:
+                return
+            found = dataclasses.replace(case, correlation=correlations(case, fixed, seen, truth))
+            with records.open("a") as file:
+                file.write(json.dumps(dataclasses.asdict(found)) + "\n")
+            print(found, flush=True)
 
 
-def correlations(
-    fixed: Fixed, seen: Batches, truth: Branches, options: Options
-) -> Iterator[tuple[str, Tensor]]:
-    """Each critic's name, and the correlation of its advantages with the true ones in every batch."""
-    for kernel, targets in product(KERNELS, TARGETS):
-        numbers = PolicyGradientConfig(
-            kernel=kernel,
-            targets=targets,
-            budget=options.budget,
-            discount=fixed.setting.discount,
-            visited=seen.data[0].numel(),
-        )
-        yield f"{kernel}, {targets}", truth.correlation(fit_gaussian(seen, numbers))
-    yield (
-        "successor on (s, a), differences",
-        torch.stack(
-            [on_states_and_actions(fixed, seen, index, truth, options) for index in range(options.batches)]
-        ),
+def correlations(case: Case, fixed: Fixed, seen: Batches, truth: Branches) -> tuple[float, ...]:
+    """Correlation of a critic's advantages with the true ones, for every batch."""
+    numbers = PolicyGradientConfig(
+        kernel=case.kernel,
+        targets="differences",
+        budget=case.budget,
+        discount=fixed.setting.discount,
+        lengthscale=LENGTHSCALE,
+        noise=NOISE,
+        visited=seen.data[0].numel(),
     )
+    return tuple(round(value, 3) for value in truth.correlation(fit_gaussian(seen, numbers)).tolist())
 
 
-def on_states_and_actions(
-    fixed: Fixed, seen: Batches, index: int, truth: Branches, options: Options
-) -> Tensor:
-    """The same for a process on a graph of states and actions, taught r = Q(s, a) − γ Q(s', mean action)."""
-    data, head = seen.data[index], seen.policy.head
-    with torch.no_grad():
-        following = head.parameters_at(seen.data["next", "observation"])[0][index]
-    half = float(head.half_range.flatten()[0])
-    unit = torch.cat([data["observation"].flatten(0, 1).std(0), torch.full((1,), half)]).double()
+def read_cases(records: Path) -> list[Case]:
+    """All that was found so far."""
+    lines = records.read_text().splitlines() if records.exists() else []
+    rows = (json.loads(line) for line in lines)
+    return [Case(**row | {"correlation": tuple(row["correlation"])}) for row in rows]
 
-    def inputs(observation: Tensor, action: Tensor) -> Tensor:
-        return torch.cat([observation, action.clamp(-half, half)], -1).double().flatten(0, 1) / unit
 
-    x, after = inputs(data["observation"], data["action"]), inputs(data["next", "observation"], following)
-    reward = data["next", "reward"].double().flatten()
-    reward = (reward - reward.mean()) / seen.true_return[index].std()
-    visited = Experience(x.shape[-1], len(x) + 1)
-    visited.add(x, after)
-    kernel = SuccessorWithRest(visited, fixed.setting.discount)
-    state, action = VALUES_VARY_OVER
-    kernel.suit(x.new_tensor([*[state] * (x.shape[-1] - 1), action]))
-    gp = SparseOnlineGP(kernel, options.budget, NOISE * float(reward.var()))
-    gp.update(x, reward, next_inputs=after, discount=fixed.setting.discount)
-    with torch.no_grad():
-        estimate = gp.posterior(inputs(truth.observation, truth.action)).mean.reshape(truth.mean_return.shape)
-    parts = (values - values.mean(-1, keepdim=True) for values in (estimate, truth.mean_return.double()))
-    return correlation(*(part.flatten() for part in parts))
+def draw(cases: list[Case], path: Path) -> None:
+    """Mean correlation against steps of experience, at the larger budget in full lines."""
+    policies = dict.fromkeys(case.policy for case in cases)
+    figure = Figure(figsize=(4.6 * len(policies), 3.6), layout="constrained")
+    panels = figure.subplots(1, len(policies), squeeze=False, sharey=True)[0]
+    most = max(case.budget for case in cases)
+    for axes, policy in zip(panels, policies, strict=True):
+        for index, kernel in enumerate(KERNELS):
+            for budget in dict.fromkeys(case.budget for case in cases):
+                rows = [c for c in cases if (c.policy, c.kernel, c.budget) == (policy, kernel, budget)]
+                steps = [case.episodes * STEPS for case in rows]
+                means = [statistics.fmean(case.correlation) for case in rows]
+                style, label = ("-", kernel) if budget == most else ("--", None)
+                axes.plot(steps, means, f"o{style}", color=f"C{index}", label=label, markersize=4)
+        axes.set(xscale="log", xlabel="steps of experience", title=policy)
+        axes.grid(alpha=0.25, linewidth=0.5)
+    panels[0].set_ylabel("correlation of advantages with the truth")
+    panels[0].legend(frameon=False, fontsize="small")
+    figure.savefig(path, dpi=130)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from typing import get_args
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import Bounded
 
 from torch_gprl.critics import (
     GPActionValue,
@@ -19,16 +20,27 @@ from torch_gprl.critics import (
 )
 from torch_gprl.gp import SparseOnlineGP
 from torch_gprl.graphs import Experience, TransitionGraph
-from torch_gprl.kernels import GaussianInputs, Matern, SquaredExponential
+from torch_gprl.kernels import GaussianInputs, Matern, SquaredExponential, SuccessorWithRest
+from torch_gprl.policies import GaussianPolicy, LinearController, gaussian_policy
 
 LEARNERS, STATES, ACTIONS, DISCOUNT = 2, 2, 1, 0.9
 LENGTHSCALE = torch.tensor([0.5, 0.8, 3.0], dtype=torch.float64)
-ON_GRAPHS = ("shortest-path", "geodesic", "successor")
+ON_GRAPHS = ("shortest-path", "geodesic", "successor", "successor-actions")
+CLOSED = [name for name in get_args(KernelName) if name != "successor-actions"]
 
 
 def made(name: KernelName, capacity: int = 80) -> GPActionValue:
     kernel = action_value_kernel(name, LENGTHSCALE, ACTIONS, LEARNERS, DISCOUNT, capacity)
     return GPActionValue(SparseOnlineGP(kernel, 40, 0.05, 0.0))
+
+
+def acting() -> GaussianPolicy:
+    """A policy of one action, −s₁ + s₂ / 2 within ±1."""
+    controller = LinearController(STATES, ACTIONS, (LEARNERS,))
+    with torch.no_grad():
+        controller.weight.copy_(torch.tensor([[-1.0], [0.5]]))
+    spec = Bounded(-1.0, 1.0, (LEARNERS, 1, ACTIONS), dtype=torch.float64)
+    return gaussian_policy(controller.double(), spec, 0.3, 0, learners=range(LEARNERS))
 
 
 def transitions(steps: int = 20) -> TensorDict:
@@ -49,7 +61,7 @@ def transitions(steps: int = 20) -> TensorDict:
     return TensorDict(data, shape)
 
 
-@pytest.mark.parametrize("name", get_args(KernelName))
+@pytest.mark.parametrize("name", CLOSED)
 def test_covariances_are_positive_and_averages_over_actions_are_closed(name):
     critic, data = made(name), transitions()
     store_transitions(critic, data)
@@ -82,7 +94,7 @@ def test_graphs_grow_with_experience_and_keep_the_newest(name):
     critic = made(name, capacity=60)
     for round_ in range(2):
         data = transitions()
-        store_transitions(critic, data)
+        store_transitions(critic, data, acting())
         critic.update(data)
         follow_basis(critic)
         (graph,) = graphs(critic)
@@ -91,7 +103,8 @@ def test_graphs_grow_with_experience_and_keep_the_newest(name):
         else:
             assert int(graph.size) == min(40 * (round_ + 1), 60)
             newest = data["observation"].flatten(1, 2)[:, -40:]
-            torch.testing.assert_close(graph.states[:, int(graph.size) - 40 : int(graph.size)], newest)
+            stored = graph.states[:, int(graph.size) - 40 : int(graph.size), :STATES]
+            torch.testing.assert_close(stored, newest)
     clear_graphs(critic)
     (graph,) = graphs(critic)
     assert not graph.mask.any()
@@ -153,3 +166,36 @@ def test_a_graph_is_measured_by_what_values_depend_on():
     ordinary = made("matern-3/2")
     assert not suit_graphs(ordinary, x, values, 1)  # nothing to do
     torch.testing.assert_close(ordinary.gp.kernel(x, x), made("matern-3/2").gp.kernel(x, x))
+
+
+def test_on_a_graph_of_states_and_actions_todays_policy_leads_on():
+    critic, policy = made("successor-actions"), acting()
+    first, second = transitions(), transitions()
+    store_transitions(critic, first, policy)
+    with torch.no_grad():
+        policy.head.controller.weight.mul_(-0.5)
+    store_transitions(critic, second, policy)
+    (graph,) = graphs(critic)
+    assert isinstance(graph, Experience)
+    with torch.no_grad():
+        for data, rows in ((first, slice(0, 40)), (second, slice(40, 80))):
+            following = data["next", "observation"].flatten(1, 2)
+            action = policy.head.parameters_at(following)[0]
+            torch.testing.assert_close(graph.next_states[:, rows], critic.inputs(following, action))
+            taken = critic.inputs(data["observation"], data["action"])
+            torch.testing.assert_close(graph.states[:, rows], taken)
+    assert list(graph_edges(critic, 0)) == []
+    with pytest.raises(ValueError, match="needs a policy to act"):
+        store_transitions(critic, first)
+
+
+def test_a_graph_of_states_and_actions_takes_its_parameters_from_a_squared_exponential():
+    critic, data = made("successor-actions"), transitions()
+    store_transitions(critic, data, acting())
+    x = critic.inputs(data["observation"], data["action"])
+    values = (3 * x[..., 0]).sin() + 0.01 * torch.randn(x.shape[:-1], dtype=torch.float64)
+    assert suit_graphs(critic, x, values, 30)
+    kernel = critic.gp.kernel
+    assert isinstance(kernel, SuccessorWithRest)
+    assert (kernel.rest.lengthscale[:, 0] < 0.5 * kernel.rest.lengthscale[:, 2]).all()
+    torch.testing.assert_close(kernel.told.outputscale, kernel.rest.outputscale)

@@ -8,7 +8,14 @@ from torch import Tensor
 from torch.func import functional_call
 
 from torch_gprl.graphs import Experience, TransitionGraph
-from torch_gprl.kernels import GeodesicKernel, Matern, SquaredExponential, SuccessorKernel, SuccessorWithRest
+from torch_gprl.kernels import (
+    GaussianInputs,
+    GeodesicKernel,
+    Matern,
+    SquaredExponential,
+    SuccessorKernel,
+    SuccessorWithRest,
+)
 from torch_gprl.kernels.graph import TableKernel
 
 DISCOUNT = 0.9
@@ -212,6 +219,16 @@ def test_where_the_nearest_states_disagree_the_prior_stays_wide():
     assert undecided(between) > 0.05
     kernel.doubt = 2 * kernel.doubt.detach()
     assert undecided(visited) < 1e-9
+
+
+def test_a_mixture_averages_its_rest_and_takes_experience_at_the_mean():
+    rest = SquaredExponential(2, 0.7, 0.4)
+    kernel, x = SuccessorWithRest(filled(), DISCOUNT, rest=rest), inputs(3)
+    spread = GaussianInputs(x, torch.full((3, 1), 0.2, dtype=torch.float64), (1,))
+    with torch.no_grad():
+        expected = kernel.told(x, x) + rest.expected(spread, spread)
+        torch.testing.assert_close(kernel.expected(spread, spread), expected)
+        torch.testing.assert_close(kernel.expected_pairs(spread, spread), expected.diagonal())
 
 
 def test_options_out_of_range_are_named():

@@ -1,21 +1,27 @@
 """Kernels of action values by name, and the graphs of experience that some of them stand on.
 
 k((s, a), (s', a')) = k_s(s, s') · k_a(a, a'), with any kernel of states k_s and a squared exponential k_a,
-which keeps averages over a Gaussian policy in closed form. The graph of a kernel belongs to it, and so to
-what is saved and moved with the critic. A learner calls `store_transitions` before the critic learns them,
-`follow_basis` afterwards, `clear_graphs` when it scales the inputs anew, and `suit_graphs` when it fits
-hyper-parameters.
+which keeps averages over a Gaussian policy in closed form. "successor-actions" is no such product: its graph
+joins states and actions, from (s, a) to s' and what the policy does there, and so follows what an action
+leads to.
+
+The graph of a kernel belongs to it, and so to what is saved and moved with the critic. A learner calls
+`store_transitions` before the critic learns them, `follow_basis` afterwards, `clear_graphs` when it scales
+the inputs anew, and `suit_graphs` when it fits hyper-parameters.
 """
 
 from collections.abc import Iterator
+from copy import deepcopy
 from typing import Literal
 
 import torch
 from jaxtyping import Float
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
 from torch_gprl.critics.action_value import GPActionValue
+from torch_gprl.critics.gaussian_actions import action_moments
 from torch_gprl.gp import SparseOnlineGP, fit_hyperparameters
 from torch_gprl.graphs import Experience, NearestEdges, TransitionGraph
 from torch_gprl.kernels import (
@@ -23,6 +29,7 @@ from torch_gprl.kernels import (
     GeodesicKernel,
     Kernel,
     Matern,
+    Product,
     ShortestPathKernel,
     SquaredExponential,
     SuccessorWithRest,
@@ -36,10 +43,14 @@ KernelName = Literal[
     "shortest-path",
     "geodesic",
     "successor",
+    "successor-actions",
 ]
 SMOOTHNESS = {"matern-1/2": 0.5, "matern-3/2": 1.5, "matern-5/2": 2.5}
+LANDMARKS = 128  # of visited states
 NEIGHBOURS = 4  # of a state on a graph of basis vectors
 LOOKAHEAD = 5  # steps that a state off the graph is followed; more would cost more than they tell
+LOOKAHEAD_OF_ACTIONS = 20  # the same of a state with an action: what an action does takes time to show
+REWARDS = 2.0  # length scale of rewards over states, in standard deviations of the states
 
 
 def action_value_kernel(
@@ -53,7 +64,7 @@ def action_value_kernel(
     """The kernel of that name over (state, action), with parameters of its own for each learner.
 
     Args:
-        name: of the kernel of states.
+        name: of the kernel of states, or "successor-actions" of both.
         lengthscale: of the columns of states, then of those of actions, in units of the critic's inputs. A
             kernel on a graph takes the mean of the former.
         actions: how many columns are actions.
@@ -68,6 +79,8 @@ def action_value_kernel(
     if name == "squared-exponential":
         return SquaredExponential(dims, lengthscale, batch_shape=(learners,))
     states = dims - actions
+    if name == "successor-actions":
+        return _joint_kernel(lengthscale, states, learners, discount, capacity)
     of_states = _state_kernel(name, lengthscale[:states], learners, discount, capacity)
     of_actions = SquaredExponential(actions, lengthscale[states:], batch_shape=(learners,))
     first, last = tuple(range(states)), tuple(range(states, dims))
@@ -83,10 +96,23 @@ def _state_kernel(
     if name == "shortest-path":
         graph = TransitionGraph(dims, capacity, NearestEdges(NEIGHBOURS), batch)
         return ShortestPathKernel(graph, length, interpolate=NEIGHBOURS)
-    visited = Experience(dims, capacity, min(128, capacity), batch_shape=batch)
+    visited = Experience(dims, capacity, min(LANDMARKS, capacity), batch_shape=batch)
     if name == "geodesic":
         return GeodesicKernel(visited, discount, length)
     return SuccessorWithRest(visited, discount, length, LOOKAHEAD)
+
+
+def _joint_kernel(
+    lengthscale: Tensor, states: int, learners: int, discount: float, capacity: int
+) -> SuccessorWithRest:
+    """On a graph of states and actions, whose distances count actions as little as values do."""
+    dims, batch = len(lengthscale), (learners,)
+    visited = Experience(dims, capacity, min(LANDMARKS, capacity), batch_shape=batch)
+    visited.lengthscale[..., states:] = lengthscale[states:]
+    rewards = lengthscale.clone()
+    rewards[:states] = REWARDS
+    rest = SquaredExponential(dims, lengthscale, batch_shape=batch)
+    return SuccessorWithRest(visited, discount, rewards, LOOKAHEAD_OF_ACTIONS, rest)
 
 
 def graphs(critic: GPActionValue) -> Iterator[TransitionGraph | Experience]:
@@ -97,12 +123,14 @@ def graphs(critic: GPActionValue) -> Iterator[TransitionGraph | Experience]:
 
 
 def graph_edges(critic: GPActionValue, learner: int) -> Iterator[Float[Tensor, "edges 2 S"]]:
-    """Both ends of the edges of each graph of one learner, as observations: visited steps, or neighbours."""
+    """Both ends of the edges of each graph of states of one learner: visited steps, or neighbours."""
     for graph in graphs(critic):
         if isinstance(graph, TransitionGraph):
             points, ends = graph.points[learner], graph.lengths[learner].isfinite().triu(1).nonzero()
         else:
             points, used = graph.states[learner], slice(int(graph.size))
+            if points.shape[-1] == critic.gp.kernel.input_dim:  # of states and actions
+                continue
             goes_on = ~(graph.ends | graph.terminated)[learner, used]
             first = goes_on.nonzero().squeeze(-1)
             ends = torch.stack([first, graph.after_nodes[learner, first, 0]], -1)
@@ -111,7 +139,11 @@ def graph_edges(critic: GPActionValue, learner: int) -> Iterator[Float[Tensor, "
 
 
 @torch.no_grad()
-def store_transitions(critic: GPActionValue, transitions: TensorDictBase) -> None:
+def store_transitions(
+    critic: GPActionValue,
+    transitions: TensorDictBase,
+    policy: ProbabilisticTensorDictSequential | None = None,
+) -> None:
     """Store transitions in the graph of visited states; nothing under a kernel without one.
 
     What the critic has learned before it sees through the new graph.
@@ -119,19 +151,40 @@ def store_transitions(critic: GPActionValue, transitions: TensorDictBase) -> Non
     Args:
         critic: whose kernel it is.
         transitions: [learners, ...] with observation, action, and under "next" observation and terminated.
+        policy: Gaussian policy, whose mean actions lead on in a graph of states and actions, from states
+            stored earlier too.
+
+    Raises:
+        ValueError: a graph of states and actions without a policy.
     """
     for graph in graphs(critic):
         if isinstance(graph, TransitionGraph):
             continue
-        dims = graph.states.shape[-1]
-        action, following = transitions.get(critic.in_keys[1]), transitions.get("next")
-        states, next_states = (
-            critic.inputs(part.get(critic.in_keys[0]), action)[..., :dims]
-            for part in (transitions, following)
-        )
+        dims, following = graph.states.shape[-1], transitions.get("next")
+        action = next_action = transitions.get(critic.in_keys[1])
+        if dims == critic.gp.kernel.input_dim:
+            if policy is None:
+                raise ValueError("a graph of states and actions needs a policy to act in the next states")
+            next_action = action_moments(policy, following)[0]
+            _follow_policy(graph, critic, policy, action.shape[-1])
+        states = critic.inputs(transitions.get(critic.in_keys[0]), action)[..., :dims]
+        next_states = critic.inputs(following.get(critic.in_keys[0]), next_action)[..., :dims]
         terminated = following.get("terminated").reshape(states.shape[:-1])
         newest = slice(-graph.capacity, None)
         graph.add(states[:, newest], next_states[:, newest], terminated[:, newest])
+
+
+def _follow_policy(
+    graph: Experience, critic: GPActionValue, policy: ProbabilisticTensorDictSequential, actions: int
+) -> None:
+    """Put today's actions into the next states that are stored; the graph shows it once more are added."""
+    stored = graph.next_states[..., : int(graph.size), :]
+    states, key = stored.shape[-1] - actions, critic.in_keys[0]
+    observation = stored * critic.input_scale.unsqueeze(-2) + critic.input_loc.unsqueeze(-2)
+    like = next(policy.parameters())
+    data = TensorDict({key: observation[..., :states].to(like)}, stored.shape[:-1])
+    action = action_moments(policy, data)[0]
+    stored[..., states:] = critic.inputs(observation[..., :states], action.to(observation))[..., states:]
 
 
 def suit_graphs(
@@ -153,24 +206,21 @@ def suit_graphs(
     Returns:
         whether there was such a kernel, and no further fit is wanted.
     """
-    kernel = critic.gp.kernel
-    successors = [part for part in kernel.modules() if isinstance(part, SuccessorWithRest)]
-    for successor in successors:
-        learners, dims, states = len(inputs), inputs.shape[-1], successor.input_dim
-        of_states = Matern(states, batch_shape=(learners,), smoothness=0.5)
-        of_actions = SquaredExponential(dims - states, batch_shape=(learners,))
-        ordinary = Columns(of_states, tuple(range(states)), dims)
-        ordinary = ordinary * Columns(of_actions, tuple(range(states, dims)), dims)
-        process = SparseOnlineGP(ordinary.to(inputs), 1, critic.gp.noise_variance.detach())
+    kernel, dims = critic.gp.kernel, inputs.shape[-1]
+    for successor in kernel.modules():
+        if not isinstance(successor, SuccessorWithRest):
+            continue
+        ordinary = of_values = deepcopy(successor.rest).requires_grad_(True)
+        if isinstance(kernel, Product):
+            ordinary = Columns(of_values, range(successor.input_dim), dims) * kernel.parts[1]
+        process = SparseOnlineGP(ordinary, 1, critic.gp.noise_variance.detach())
         fit_hyperparameters(process, inputs, targets, steps)
-        successor.suit(of_states.lengthscale, of_states.outputscale)
-        for part in kernel.modules():
-            if isinstance(part, SquaredExponential):  # that of actions
-                part.load_state_dict(of_actions.state_dict())
+        successor.suit(of_values.lengthscale, of_values.outputscale)
         with torch.no_grad():
             critic.gp.log_noise_variance.copy_(process.log_noise_variance)
         critic.gp.rebase()
-    return bool(successors)
+        return True
+    return False
 
 
 @torch.no_grad()

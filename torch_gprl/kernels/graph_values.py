@@ -11,33 +11,44 @@ from torch import Tensor
 
 from torch_gprl.graphs.experience import Experience
 from torch_gprl.kernels.base import Sum
+from torch_gprl.kernels.gaussian_inputs import GaussianInputs
 from torch_gprl.kernels.graph_successor import SuccessorKernel
 from torch_gprl.kernels.parameters import PositiveValue
-from torch_gprl.kernels.stationary import Matern
+from torch_gprl.kernels.stationary import Matern, Stationary
 
 REWARDS = 2.0  # length scales of rewards, in those of values, which are rougher
 
 
 class SuccessorWithRest(Sum):
-    """`SuccessorKernel` + Matérn 1/2, with length scales and variances by `suit`.
+    """`SuccessorKernel` + an ordinary kernel, with length scales and variances by `suit`.
+
+    Over Gaussian columns the rest is averaged in closed form, and what experience tells is taken at the mean:
+    averages over several points carry the noise of more neighbours, and rank actions less well.
 
     Args:
         experience: visited states and transitions; may grow at any time.
         discount: γ of the values that are learned, between 0 and 1.
-        lengthscale: of rewards and of the rest until `suit`, in units of the inputs; broadcasts to
-            [*batch, D].
+        lengthscale: of rewards, and of a Matérn 1/2 rest, until `suit`, in units of the inputs; broadcasts
+            to [*batch, D].
         lookahead: as `SuccessorKernel`.
+        rest: another ordinary kernel of the same batch.
 
     Raises:
         ValueError: as `SuccessorKernel`.
     """
 
     def __init__(
-        self, experience: Experience, discount: float, lengthscale: PositiveValue = 1.0, lookahead: int = 20
+        self,
+        experience: Experience,
+        discount: float,
+        lengthscale: PositiveValue = 1.0,
+        lookahead: int = 20,
+        rest: Stationary | None = None,
     ) -> None:
         dims, batch = experience.states.shape[-1], experience.states.shape[:-2]
         told = SuccessorKernel(experience, discount, lengthscale, lookahead=lookahead)
-        rest = Matern(dims, lengthscale, batch_shape=batch, smoothness=0.5)
+        if rest is None:
+            rest = Matern(dims, lengthscale, batch_shape=batch, smoothness=0.5)
         for kernel in (told, rest):
             kernel.log_lengthscale.requires_grad_(False)  # a fit would need the graph anew at every step
         super().__init__(told, rest)
@@ -50,10 +61,10 @@ class SuccessorWithRest(Sum):
         return told
 
     @property
-    def rest(self) -> Matern:
+    def rest(self) -> Stationary:
         """What it cannot tell."""
         rest = self.kernels[1]
-        assert isinstance(rest, Matern)
+        assert isinstance(rest, Stationary)
         return rest
 
     def suit(
@@ -64,7 +75,7 @@ class SuccessorWithRest(Sum):
         See `Experience.pulled_back`. What a process has learned needs `rebase` afterwards.
 
         Args:
-            lengthscale: of a Matérn 1/2 kernel fitted to values [*batch, D], in units of the inputs.
+            lengthscale: of a kernel like the rest, fitted to values [*batch, D], in units of the inputs.
             outputscale: its prior variance [*batch], given to each of the two parts.
         """
         experience = self.told.experience
@@ -73,3 +84,6 @@ class SuccessorWithRest(Sum):
         self.rest.lengthscale = lengthscale.detach().expand(experience.lengthscale.shape)
         for kernel in (self.told, self.rest):
             kernel.outputscale = outputscale
+
+    def _expected(self, x: GaussianInputs, z: GaussianInputs) -> Tensor:
+        return self.told(x.mean, z.mean) + self.rest.expected(x, z)

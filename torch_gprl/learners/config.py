@@ -91,8 +91,8 @@ class PolicyGradientConfig:
 
     targets: Targets = "returns"  # the critic learns values from returns, or rewards as temporal differences
     in_sample: bool = False  # the critic learns a rollout before it judges it
-    kernel: KernelName = "squared-exponential"  # of states; of actions it is the squared exponential
-    visited: int = 1_000  # newest transitions that the kernels "geodesic" and "successor" stand on
+    kernel: KernelName = "squared-exponential"  # of states, times one of actions; "successor-actions": both
+    visited: int = 1_000  # newest transitions that "geodesic", "successor" and "successor-actions" stand on
     budget: int = 150  # basis vectors of the critic
     novelty_threshold: float = 0.3  # novelty that makes a point a basis vector, in noise variances
     renew_every: int = 20  # policy updates between renewals of the critic, which forget older data; 1: each
@@ -126,7 +126,7 @@ class PolicyGradientConfig:
                 "improvements need a replay, estimator 'all-action' and discount_states off, got replay "
                 f"{self.replay}, {self.estimator!r} and {self.discount_states}"
             )
-        if self.kernel in ("geodesic", "successor") and not 0 < self.discount < 1:
+        if self.kernel in ("geodesic", "successor", "successor-actions") and not 0 < self.discount < 1:
             raise ValueError(f"kernel {self.kernel!r} needs a discount between 0 and 1, got {self.discount}")
         if self.critic == "neural" and self.estimator not in BY_STATE_VALUES:
             choices = ", ".join(BY_STATE_VALUES)

@@ -97,7 +97,7 @@ class Teacher:
         young = update & (update - 1) == 0  # a power of two: values change fast at first
         if update % config.renew_every == 0 or (young and update < config.renew_every):
             self._renew(rollout, update)
-        store_transitions(self.critic, rollout)
+        store_transitions(self.critic, rollout, self.policy)
         if config.targets == "returns":
             self.critic.update(rollout, stamp=update)
         else:
@@ -111,14 +111,14 @@ class Teacher:
         self.experience.extend(transitions)
         self.fresh += transitions.shape[1]
         if self.fresh < RENEWED_SHARE * len(self.experience):
-            store_transitions(self.critic, rollout)
+            store_transitions(self.critic, rollout, self.policy)
             return
         self.fresh, critic, remembered = 0, self.critic, self._remembered()
         observation, action = remembered.get("observation"), remembered.get("action")
         critic.standardise(observation, action, remembered.get(("next", "reward")))
         self._scale_values(remembered)
         clear_graphs(critic)
-        store_transitions(critic, self.experience.all())
+        store_transitions(critic, self.experience.all(), self.policy)
         dims = observation.shape[-1], action.shape[-1]
         critic.cover(observation, action, _lengthscale(*dims, self.config).to(critic.input_loc))
 
@@ -169,7 +169,7 @@ class Teacher:
         on_graph = any(True for _ in graphs(critic))
         if on_graph:
             stored, points = rollout.chunk(2, dim=1 if rollout.shape[1] > 1 else 2)
-            store_transitions(critic, stored)
+            store_transitions(critic, stored, self.policy)
             states = critic.inputs(stored.get("observation"), stored.get("action"))
             follow_basis(critic, _spread_over(states, min(TUNING_NODES, self.config.budget)))
         inputs = critic.inputs(points.get("observation"), points.get("action"))

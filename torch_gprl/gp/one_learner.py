@@ -13,7 +13,7 @@ from torch import Tensor
 from torch_gprl.gp.bounded import YOUTH, BoundedBasis, admissions
 from torch_gprl.gp.observed import Observed
 from torch_gprl.gp.one_point import InUse
-from torch_gprl.gp.whitened import NOVELTY_FLOOR, solve_triangular, squared_columns
+from torch_gprl.gp.whitened import NOVELTY_FLOOR, squared_columns
 
 LOG_TWO_PI = math.log(2 * math.pi)
 LARGE = 128  # rows and points from which a matrix product in parts is faster
@@ -23,11 +23,8 @@ def absorb(gp: BoundedBasis, block: Observed, noise_variance: float) -> None:
     """Bayes' rule on a block of plain data: grow the basis, absorb every point, prune to the budget."""
     inputs, targets = _only(block.inputs, 2), _only(block.targets, 1)
     points = len(inputs)
-    if points == 1:
-        rows = _absorb_point(gp, inputs, targets, noise_variance)
-    else:
-        rows = _absorb_block(gp, inputs, targets, noise_variance)
-        gp.observations.add_(points)
+    learn = _absorb_point if points == 1 else _absorb_block
+    rows = learn(gp, inputs, targets, noise_variance)
     if not gp._stale:
         gp._stale = True
     if rows > gp.capacity - int(gp._room(points)):
@@ -36,21 +33,25 @@ def absorb(gp: BoundedBasis, block: Observed, noise_variance: float) -> None:
 
 def _absorb_block(gp: BoundedBasis, inputs: Tensor, targets: Tensor, noise_variance: float) -> int:
     """The rows in use afterwards."""
-    phi, prior = _explain(gp, inputs)
-    novelty = prior - squared_columns(phi)
-    threshold = (prior * NOVELTY_FLOOR[phi.dtype]).clamp_min_(gp.novelty_threshold * noise_variance)
+    used = InUse.of(gp)
+    phi, prior = used.features(inputs), used.prior
+    if prior is None:
+        prior = _only(gp.kernel.diag(inputs), 1)
+    novelty = squared_columns(phi).neg_().add_(prior)
+    threshold = _at_least(gp.novelty_threshold * noise_variance, prior * NOVELTY_FLOOR[phi.dtype])
     if float((novelty - threshold).amax()) > 0 and (most := _most_additions(gp, len(phi), len(inputs))):
         phi, novelty = _add_most_novel(gp, inputs, phi, novelty, threshold, most)
-    rows = len(phi)
+        used = InUse.of(gp)
     # moment: W = 1/(σ0² + ν); dtc ignores what the basis misses
     variance = novelty.add_(noise_variance) if gp.projection == "moment" else novelty.fill_(noise_variance)
     scale = variance.rsqrt()
     phi, targets = phi.mul_(scale), targets * scale
-    _add_gram(_only(gp.precision, 2)[:rows, :rows], phi)  # A += Φ W Φᵀ
-    _only(gp.information, 1)[:rows].add_(phi.mv(targets))  # b += Φ W y
-    log_density = variance.log_().sum() + targets.dot(targets)
-    gp.evidence_constant.sub_(log_density + len(inputs) * LOG_TWO_PI, alpha=0.5)
-    return rows
+    _add_gram(used.precision, phi)  # A += Φ W Φᵀ
+    used.information.add_(phi.mv(targets))  # b += Φ W y
+    log_density = float(variance.log_().sum()) + float(targets.dot(targets)) + len(inputs) * LOG_TWO_PI
+    used.evidence[0] -= 0.5 * log_density
+    used.observations[0] += len(inputs)
+    return len(phi)
 
 
 def _absorb_point(gp: BoundedBasis, point: Tensor, target: Tensor, noise_variance: float) -> int:
@@ -67,18 +68,14 @@ def _absorb_point(gp: BoundedBasis, point: Tensor, target: Tensor, noise_varianc
     weight = 1 / (noise_variance + novelty) if gp.projection == "moment" else 1 / noise_variance
     observed, column = float(target), torch.from_numpy(phi)
     used.precision.addmm_(column.unsqueeze(1), column.unsqueeze(0), alpha=weight)  # A += φ w φᵀ
-    phi *= weight * observed
-    np.add(used.information, phi, out=used.information)  # b += φ w y
+    used.information.add_(column, alpha=weight * observed)  # b += φ w y
     used.evidence[0] += 0.5 * (math.log(weight) - weight * observed**2 - LOG_TWO_PI)
     used.observations[0] += 1
     return len(phi)
 
 
-def _explain(gp: BoundedBasis, inputs: Tensor) -> tuple[Tensor, Tensor]:
-    """φ in columns, and the prior variance."""
-    active = gp._active()
-    phi = solve_triangular(_only(active.gram_factor, 2), _only(active.cross(inputs), 2))
-    return phi, _only(gp.kernel.diag(inputs), 1)
+def _at_least(least: float, values: float | Tensor) -> float | Tensor:
+    return values.clamp_min(least) if isinstance(values, Tensor) else max(values, least)
 
 
 def _most_additions(gp: BoundedBasis, rows: int, points: int) -> int:
@@ -93,26 +90,29 @@ def _most_additions(gp: BoundedBasis, rows: int, points: int) -> int:
 
 
 def _add_most_novel(
-    gp: BoundedBasis, inputs: Tensor, phi: Tensor, novelty: Tensor, threshold: Tensor, most: int
+    gp: BoundedBasis, inputs: Tensor, phi: Tensor, novelty: Tensor, threshold: float | Tensor, most: int
 ) -> tuple[Tensor, Tensor]:
     """Partially pivoted Cholesky of what the basis misses: one row of L, and of Φ, for each point picked."""
     before = rows = len(phi)
-    features = phi.new_empty(len(inputs), before + most)  # Φᵀ
-    features[:, :before] = phi.mT
-    covariance, pivots = _only(gp.kernel(inputs, inputs), 2), list[int]()
+    features = np.empty((len(inputs), before + most), novelty.numpy().dtype)  # Φᵀ
+    features[:, :before] = phi.mT.numpy()
+    covariance, pivots = _only(gp.kernel(inputs, inputs), 2).numpy(), list[int]()
+    missed, least = novelty.numpy(), threshold.numpy() if isinstance(threshold, Tensor) else threshold
     while rows < before + most:
-        excess, best = (novelty - threshold).max(0)
-        if float(excess) <= 0:
+        excess = missed - least
+        pivot = int(excess.argmax())
+        if excess[pivot] <= 0:
             break
-        pivot, known = int(best), features[:, :rows]
-        row = torch.addmv(covariance[pivot], known, known[pivot], alpha=-1)
-        features[:, rows] = row.mul_(row[pivot].rsqrt())
-        novelty.addcmul_(row, row, value=-1)
-        novelty[pivot] = 0.0  # nothing is missed of a basis vector
+        row = covariance[pivot] - features[:, :rows] @ features[pivot, :rows]
+        row /= math.sqrt(row[pivot])
+        features[:, rows] = row
+        missed -= row * row
+        missed[pivot] = 0.0  # nothing is missed of a basis vector
         pivots.append(pivot)
         rows += 1
-    _append(gp, before, features[pivots, :rows].tril_(before), inputs[pivots])
-    return features[:, :rows].mT, novelty
+    known = torch.from_numpy(features)[:, :rows]
+    _append(gp, before, known[pivots].tril_(before), inputs[pivots])
+    return known.mT, novelty
 
 
 def _append(gp: BoundedBasis, before: int, gram_rows: Tensor, points: Tensor) -> None:

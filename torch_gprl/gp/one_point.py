@@ -16,6 +16,7 @@ from torch import Tensor
 from torch_gprl.gp.bounded import BoundedBasis
 from torch_gprl.gp.posterior import Posterior
 from torch_gprl.gp.whitened import Active, Solved
+from torch_gprl.kernels.distance import GaussianBumps
 from torch_gprl.kernels.stationary import Stationary
 
 Map = Callable[[np.ndarray], np.ndarray]
@@ -28,8 +29,9 @@ class InUse(NamedTuple):
     whole: Tensor  # the precision of all rows, likewise
     covary: Map  # x [D] ↦ k(X_B, x) [R]
     explain: Map  # k(X_B, x) [R] ↦ φ = L⁻¹k [R]
+    gram_factor: Tensor  # [R, R]
     precision: Tensor  # [R, R]
-    information: np.ndarray  # [R]
+    information: Tensor  # [R]
     evidence: np.ndarray  # the evidence's constant, [1]
     observations: np.ndarray  # [1]
     prior: float | None  # the kernel's variance, where it is the same everywhere
@@ -46,14 +48,22 @@ class InUse(NamedTuple):
             gp.precision,
             _single(active.cross),
             _substitution(active.gram_factor),
+            active.gram_factor.view(rows, rows),
             gp.precision.view(gp.capacity, gp.capacity)[:rows, :rows],
-            gp.information.numpy().reshape(-1)[:rows],
+            gp.information.view(-1)[:rows],
             gp.evidence_constant.numpy().reshape(-1),
             gp.observations.numpy().reshape(-1),
             float(kernel.outputscale) if isinstance(kernel, Stationary) else None,
         )
         gp._in_use = found
         return found
+
+    def features(self, inputs: Tensor) -> Tensor:
+        """φ of inputs [N, D] in columns: [R, N]."""
+        cross = self.active.cross(inputs)
+        cross = cross.view(cross.shape[-2:])
+        memory = cross if isinstance(self.active.cross, GaussianBumps) else None  # which nobody else holds
+        return torch.linalg.solve_triangular(self.gram_factor, cross, upper=False, out=memory)
 
     def prior_at(self, gp: BoundedBasis, point: Tensor) -> float:
         """k(x, x)."""

@@ -27,7 +27,7 @@ from benchmarks.exploration_arms import ARMS, GAUSSIAN, MATCHED, SETTINGS, Outco
 from benchmarks.exploration_pictures import Snapshots, draw
 
 SHOWN = ("steps to threshold", "steps to discovery", "final return", "time in goal", "entropy of cells")
-GROUP = 10  # learners of one program
+GROUP = 5  # learners of one program
 QUICK_LEARNERS, QUICK_SHARE = 4, 5  # learners, and the part of the steps that a quick run takes
 
 

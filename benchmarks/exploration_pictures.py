@@ -37,7 +37,8 @@ class Snapshots:
         if self.setting.task not in DIMS:
             return
         if isinstance(learner, DynamicProgramming):
-            self._take_plan(learner)
+            if learner.critic.planned:
+                self._take_plan(learner)
         elif learner.teacher.taught:
             self._take_critic(learner)
 

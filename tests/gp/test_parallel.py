@@ -21,6 +21,7 @@ OPTIONS: dict[str, Any] = {"budget": 20, "noise_variance": 0.02, "novelty_thresh
 
 def _process(rank: int, store: Path, job: Callable, arguments: tuple, results: Path) -> None:
     dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=WORLD)
+    dist.barrier()  # a job that needs nobody could end before the other process has connected
     try:
         torch.save(job(rank, *arguments), results / f"{rank}.pt")
     finally:

@@ -51,7 +51,7 @@ def draw_graph(system: System, truth: Truth, seen: Trajectories, path: Path) -> 
     left.plot(
         *system.plane(graph.points).unbind(-1), "o", color="white", markeredgecolor="black", markersize=3.5
     )
-    left.set_title(f"graph of {NODES} landmarks, {int(graph.components())} part(s)", fontsize="medium")
+    left.set_title(f"{NODES} landmarks, each with its {NEIGHBOURS} nearest", fontsize="medium")
     left.set_ylabel(system.axes[1])
     _lines(right, system, states, next_states, "#d62728")
     right.set_title("visited transitions", fontsize="medium")

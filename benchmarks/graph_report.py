@@ -5,13 +5,19 @@ import math
 import statistics
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table
+from scipy.stats import t
 
 from benchmarks.graph_arms import EUCLIDEAN
 
 DIGITS = 4
+COLUMNS = (
+    *("seeds", "RMSE", "spread", "gain", "± 95 %", "near", "far"),
+    *("NLPD", "gain", "± 95 %", "tune s", "learn s", "predict s"),
+)
 
 
 @dataclass(frozen=True)
@@ -35,28 +41,40 @@ def show(scores: list[Score]) -> None:
     """Print means over seeds, and what each kernel gains over the best Euclidean one."""
     for problem, budget in dict.fromkeys((s.problem, s.budget) for s in scores):
         by_kernel = _by_kernel(scores, problem, budget)
-        euclidean = min((_mean(by_kernel[k], "rmse") for k in EUCLIDEAN if k in by_kernel), default=math.nan)
-        columns = (
-            "seeds",
-            "RMSE",
-            "± seeds",
-            "gain",
-            "near",
-            "far",
-            "NLPD",
-            "tune s",
-            "learn s",
-            "predict s",
-        )
-        table = Table("kernel", *columns, title=f"{problem}, {budget} basis vectors")
+        table = Table("kernel", *COLUMNS, title=f"{problem}, {budget} basis vectors")
         for kernel, runs in by_kernel.items():
-            rmse = _mean(runs, "rmse")
             spread = statistics.stdev(s.rmse for s in runs) if len(runs) > 1 else math.nan
-            errors = [f"{_mean(runs, key):.3f}" for key in ("rmse_near", "rmse_far", "nlpd")]
-            seconds = [f"{_mean(runs, key):.2f}" for key in ("tuning", "learning", "predicting")]
-            gain = f"{1 - rmse / euclidean:+.0%}"
-            table.add_row(kernel, str(len(runs)), f"{rmse:.3f}", f"{spread:.3f}", gain, *errors, *seconds)
-        Console(width=150).print(table)
+            error, fewer = paired_gain(by_kernel, kernel, "rmse"), paired_gain(by_kernel, kernel, "nlpd")
+            best = error.mean + _mean(runs, "rmse")
+            near, far, *seconds = (
+                f"{_mean(runs, key):.2f}"
+                for key in ("rmse_near", "rmse_far", "tuning", "learning", "predicting")
+            )
+            gained = f"{error.mean / best:+.0%}", f"± {error.half / best:.0%}"
+            density = f"{_mean(runs, 'nlpd'):.2f}", f"{fewer.mean:+.2f}", f"± {fewer.half:.2f}"
+            shown = f"{_mean(runs, 'rmse'):.3f}", f"{spread:.3f}"
+            table.add_row(kernel, str(len(runs)), *shown, *gained, near, far, *density, *seconds)
+        Console(width=160).print(table)
+
+
+class Gain(NamedTuple):
+    """How much less a kernel has of something, and half of the 95 % interval of that."""
+
+    mean: float
+    half: float
+
+
+def paired_gain(by_kernel: dict[str, list[Score]], kernel: str, key: str) -> Gain:
+    """What a kernel spares against the Euclidean one that is best on average, paired by seed."""
+    rivals = [by_kernel[name] for name in EUCLIDEAN if name in by_kernel]
+    if not rivals:
+        return Gain(math.nan, math.nan)
+    best = {s.seed: getattr(s, key) for s in min(rivals, key=lambda runs: _mean(runs, key))}
+    spared = [best[s.seed] - getattr(s, key) for s in by_kernel[kernel] if s.seed in best]
+    if len(spared) < 2:
+        return Gain(spared[0] if spared else math.nan, math.nan)
+    error = statistics.stdev(spared) / math.sqrt(len(spared))
+    return Gain(statistics.fmean(spared), float(t.ppf(0.975, len(spared) - 1)) * error)
 
 
 def write_summary(scores: list[Score], path: Path) -> None:

@@ -190,7 +190,7 @@ def test_learners_plan_apart(learner):
     torch.testing.assert_close(own, together, rtol=0, atol=0.06)  # ties between neighbours may fall apart
 
 
-@pytest.mark.parametrize(("rehearsal", "kept"), [(30, True), (0, False)])
+@pytest.mark.parametrize(("rehearsal", "kept"), [(8, True), (0, False)])
 def test_a_bad_plan_does_not_change_what_was_rehearsed_well(rehearsal, kept):
     data = walk()
     value = planned(data, discount=0.9, sweeps=1, hold=1, rehearsal=rehearsal)
@@ -205,17 +205,10 @@ def test_a_bad_plan_does_not_change_what_was_rehearsed_well(rehearsal, kept):
 
 def test_a_plan_that_earns_more_than_what_was_rehearsed_takes_over():
     data = walk()
-    value = planned(data, discount=0.9, rehearsal=30)
+    value = planned(data, discount=0.9, rehearsal=8)
     before = value.best_action(grid(), explore=False)
     state = value.state_dict()
     state["rehearsed"]["weights"] = -state["rehearsed"]["weights"]
     value.load_state_dict(state, data)
     value.plan(data, torch.zeros(2, 0, 1 + IMAGINED_STEPS, dtype=torch.float64))
     torch.testing.assert_close(value.best_action(grid(), explore=False), before, rtol=0, atol=0.3)
-
-
-def test_exploring_does_not_follow_what_was_rehearsed():
-    data = walk()
-    value, plan = planned(data, discount=0.9, rehearsal=5), planned(data, discount=0.9)
-    assert torch.equal(value.best_action(grid(), explore=True), plan.best_action(grid(), explore=True))
-    assert not torch.equal(value.best_action(grid(), explore=False), plan.best_action(grid(), explore=False))

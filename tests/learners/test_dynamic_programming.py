@@ -17,8 +17,8 @@ SMALL = DynamicProgrammingConfig(
     sweeps=5,
     backup_actions=5,
     acting_actions=9,
-    rehearsal=5,
-    ascents=2,
+    rehearsal=2,
+    ascents=1,
 )
 
 

@@ -17,9 +17,9 @@ that were met, whose value is zero: what an end pays belongs to the step that le
 The maximum is taken over averages of nearby actions, as if the hand trembled. Where many actions serve
 equally well, up to an edge beyond which none does, this keeps away from the edge.
 
-What is performed when nothing is explored is a smooth policy that begins with the plan's best actions, or
-with what was performed so far, and is rehearsed in imagination (`rehearsal`): the best actions err where many
-are worth nearly the same, and are others after every plan.
+What is performed when nothing is explored is a smooth policy, rehearsed in imagination (`rehearsal`), where
+it earns clearly more there than the plan's best actions. These err where many are worth nearly the same, and
+are others after every plan; but they switch more sharply.
 
 A second value, for exploration, takes what the model does not know for better than all that was seen
 (optimism in the face of uncertainty): a share of each backup, as large as the doubt, is the highest hope.
@@ -36,7 +36,7 @@ from torch import Tensor
 from torch_gprl.critics.ends import Ends
 from torch_gprl.critics.maximise import candidate_actions
 from torch_gprl.critics.plan import Course, Support
-from torch_gprl.critics.rehearsal import SmoothPolicy, Walks, rehearse
+from torch_gprl.critics.rehearsal import SmoothPolicy, Walks, rehearse, spread
 from torch_gprl.critics.transition_model import Prediction, TransitionModel, Transitions
 from torch_gprl.gp import Posterior
 from torch_gprl.graphs import farthest_points
@@ -47,7 +47,8 @@ EXPLOIT, EXPLORE = 0, 1  # columns of the values
 VALUE_NOISE, NOVELTY_NOISE = 1e-3, 1e-2  # of regressions under kernels of variance 1
 IMAGINED_STEPS = 2  # from a known state to an imagined one
 FIRST_SWEEPS = 3  # times as many as later: those begin from the last value
-WALKS = 24  # imagined walks of a rehearsal, from states of the experience on
+WALKS, TRIALS = 24, 8  # imagined walks, from states of the experience on: to rehearse, and to compare
+CLEARLY = 0.01  # share of the range of values by which what is rehearsed must earn more than the plan
 CHUNK = 2**22  # numbers of the largest temporary: bounds the memory
 
 
@@ -92,7 +93,8 @@ class PlannedValue:
         self._backup_actions = self._candidates(low, high, planning.backup_actions)
         self.acting_actions = self._candidates(low, high, acting_actions)
         self._support: Support | None = None  # of the plan
-        self._rehearsed: SmoothPolicy | None = None  # what is performed, if anything is rehearsed
+        self._rehearsed: SmoothPolicy | None = None
+        self._performed: Tensor | None = None  # [L, 1, 1] whether it is what is performed
 
     def _candidates(self, low: Tensor, high: Tensor, count: int) -> Tensor:
         return (candidate_actions(low, high, count) - self._centre) / self._half
@@ -130,16 +132,28 @@ class PlannedValue:
         self._support = Support(observation, scaled, self._ends.labels, loc, scale, prior, none)
         self._iterate(values, self.planning.sweeps * (1 if before is not None else FIRST_SWEEPS))
         if self.planning.rehearsal:
-            self._rehearsed = self._rehearse(data)
+            self._rehearse(data.observation)
 
-    def _rehearse(self, data: Transitions) -> SmoothPolicy:
-        """Improve what is performed, by the model and with the plan's value of where walks get to."""
-        support, last, visited = self._support, self._rehearsed, data.observation
+    def _rehearse(self, visited: Float[Tensor, "L N S"]) -> None:
+        """Improve the smooth policy by the model, and compare it with the plan's best actions."""
+        support, last = self._support, self._rehearsed
         assert support is not None
+        pool = torch.cat([support.observation, spread(visited, self.planning.support)], 1)
+        chosen = farthest_points(self._scaled(pool), self.planning.support).chosen
+        states = pool.take_along_dim(chosen.unsqueeze(-1), 1)
+        greedy = self._greedy_action(states, explore=False)
+        choices = [greedy] if last is None else [last(states), greedy]
+        policy = SmoothPolicy(states, support.loc, support.scale)
+        walks = self._walks(spread(visited, WALKS))
+        self._rehearsed = policy = rehearse(walks, policy, choices, self.planning.ascents)
+        trials = self._walks(spread(visited, TRIALS))
+        gain = trials.earned(policy) - trials.earned(lambda state: self._greedy_action(state, explore=False))
+        self._performed = (gain > CLEARLY * (self._high - self._low).squeeze(-1)).view(-1, 1, 1)
 
-        def among(count: int) -> Tensor:
-            spread = torch.linspace(0, visited.shape[1] - 1, min(count, visited.shape[1])).long()
-            return visited[:, spread.to(visited.device)]
+    def _walks(self, start: Float[Tensor, "L N S"]) -> Walks:
+        """Imagined walks by the model, with the plan's value of where they get to."""
+        support = self._support
+        assert support is not None
 
         def step(states: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             step, end = self._step(states, actions, doubt=False)
@@ -148,14 +162,7 @@ class PlannedValue:
         def value(states: Tensor) -> Tensor:
             return self._values_of(support, states)[..., EXPLOIT]
 
-        pool = torch.cat([support.observation, among(self.planning.support)], 1)
-        chosen = farthest_points(self._scaled(pool), self.planning.support).chosen
-        states = pool.take_along_dim(chosen.unsqueeze(-1), 1)
-        greedy = self.acting_actions[self.candidate_values(states, explore=False).argmax(-1)]
-        choices = [greedy] if last is None else [last(states), greedy]
-        walks = Walks(step, value, among(WALKS), self.planning.rehearsal, self.planning.discount)
-        policy = SmoothPolicy(states, support.loc, support.scale)
-        return rehearse(walks, policy, choices, self.planning.ascents)
+        return Walks(step, value, start, self.planning.rehearsal, self.planning.discount)
 
     def _kernels(self, like: Tensor) -> tuple[Kernel, Kernel]:
         """Of values and of novelty, in scaled coordinates, where the length scale of values is 1."""
@@ -303,8 +310,13 @@ class PlannedValue:
 
     def best_action(self, observation: Float[Tensor, "L N S"], explore: bool) -> Float[Tensor, "L N A"]:
         """What to do, in halves of the actuator's range: the best candidate, or what is rehearsed."""
-        if self._rehearsed is not None and not explore:
-            return self._rehearsed(observation)
+        best = self._greedy_action(observation, explore)
+        rehearsed, better = self._rehearsed, self._performed
+        if explore or rehearsed is None or better is None:
+            return best
+        return torch.where(better, rehearsed(observation), best)
+
+    def _greedy_action(self, observation: Tensor, explore: bool) -> Float[Tensor, "L N A"]:
         return self.acting_actions[self.candidate_values(observation, explore).argmax(-1)]
 
     @torch.no_grad()
@@ -367,8 +379,10 @@ class PlannedValue:
         """The plan and what is performed; what judges states follows from the experience."""
         if self._support is None:
             return {}
-        plan = {"support": self._support._asdict()}
-        return plan if self._rehearsed is None else plan | {"rehearsed": self._rehearsed.state_dict()}
+        state: dict[str, Any] = {"support": self._support._asdict()}
+        if self._rehearsed is not None:
+            state |= {"rehearsed": self._rehearsed.state_dict(), "performed": self._performed}
+        return state
 
     def load_state_dict(self, state: dict[str, Any], data: Transitions) -> None:
         """Take up what `state_dict` gave, with the experience that was planned on."""
@@ -378,3 +392,4 @@ class PlannedValue:
             self._support = Support(**state["support"])
         if "rehearsed" in state:
             self._rehearsed = SmoothPolicy.restored(state["rehearsed"])
+            self._performed = state["performed"]

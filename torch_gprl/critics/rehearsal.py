@@ -130,3 +130,10 @@ def rehearse(
             (actions.grad,) = torch.autograd.grad(walks.earned(leaking).sum(), actions)
         optimiser.step()
     return policy.learn(actions.detach())
+
+
+def spread(visited: Float[Tensor, "L N S"], count: int) -> Float[Tensor, "L M S"]:
+    """So many states, or all if there are fewer, evenly over the time in which they were visited."""
+    steps = visited.shape[1]
+    index = torch.linspace(0, steps - 1, min(count, steps), device=visited.device)
+    return visited[:, index.long()]

@@ -30,7 +30,7 @@ from torch_gprl.runs import MetricsWriter, bootstrap_interval, read_metrics, sav
 Metrics = dict[str, Float[np.ndarray, "updates L"]]
 
 # All experience solved at once, under today's policy, on a basis vector for every five steps.
-AT_ONCE = {"targets": "differences", "replay": 4_000, "budget": 800, "noise": 0.001, "lengthscale": 0.5}
+AT_ONCE = {"targets": "differences", "replay": 4_000, "budget": 800, "noise": 0.1, "lengthscale": 0.5}
 # The arms that matter most come first.
 CLAIM_1: dict[str, dict[str, Any]] = {
     "REINFORCE": {"estimator": "return", "targets": "returns"},

@@ -93,7 +93,7 @@ class PolicyGradientConfig:
     in_sample: bool = False  # the critic learns a rollout before it judges it
     kernel: KernelName = "squared-exponential"  # of states, times one of actions; "successor-actions": both
     visited: int = 1_000  # newest transitions that "geodesic", "successor" and "successor-actions" stand on
-    budget: int = 150  # basis vectors of the critic
+    budget: int = 150  # basis vectors of the critic; a replay in 4 dimensions wants a fifth of its steps
     novelty_threshold: float = 0.3  # novelty that makes a point a basis vector, in noise variances
     renew_every: int = 20  # policy updates between renewals of the critic, which forget older data; 1: each
     replay: int = 0  # newest environment steps per learner to keep and solve anew at each update; 0: none

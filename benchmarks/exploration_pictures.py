@@ -30,16 +30,19 @@ class Snapshots:
     def __init__(self, setting: Setting) -> None:
         self.setting = setting
         self.taken: dict[str, Any] = {}
+        self._moment = -1
 
     @torch.no_grad()
     def take(self, learner: Learner) -> None:
-        """Add what can be seen now."""
-        if self.setting.task not in DIMS:
+        """Add what can be seen now, once in each part of the training that has its own map."""
+        moment = learner.frames * MOMENTS // self.setting.frames
+        knows = learner.critic.planned if isinstance(learner, DynamicProgramming) else learner.teacher.taught
+        if self.setting.task not in DIMS or moment == self._moment or not knows:
             return
+        self._moment = moment
         if isinstance(learner, DynamicProgramming):
-            if learner.critic.planned:
-                self._take_plan(learner)
-        elif learner.teacher.taught:
+            self._take_plan(learner)
+        else:
             self._take_critic(learner)
 
     def _take_critic(self, learner: QLearning) -> None:

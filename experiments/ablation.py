@@ -20,17 +20,18 @@ from benchmarks import sample_efficiency, sample_report
 from benchmarks.sample_arms import GOALS, ours
 from benchmarks.timing import machine
 
+PLAN = {"rehearsal": 0}
 ROWS: dict[str, dict[str, object]] = {
     "all parts": {},
-    "no rehearsal": {"rehearsal": 0},
-    "actions held for one step": {"hold": 1},
-    "actions held for three steps": {"hold": 3},
-    "no imagined states": {"imagined": 0},
-    "no hope beyond the best seen": {"optimism": 0.0},
-    "a steady hand": {"tremble": 0.01},
-    "Matérn 3/2 value": {"smoothness": 1.5},
-    "Matérn 5/2 value": {"smoothness": 2.5},
-    "half the support": {"support": 100},
+    "the plan alone": PLAN,
+    "the plan, one step held": PLAN | {"hold": 1},
+    "the plan, three steps held": PLAN | {"hold": 3},
+    "the plan, nothing imagined": PLAN | {"imagined": 0},
+    "the plan, no hope beyond the best seen": PLAN | {"optimism": 0.0},
+    "the plan, a steady hand": PLAN | {"tremble": 0.01},
+    "the plan, Matérn 3/2 value": PLAN | {"smoothness": 1.5},
+    "the plan, Matérn 5/2 value": PLAN | {"smoothness": 2.5},
+    "the plan, half the support": PLAN | {"support": 100},
 }
 
 

@@ -30,11 +30,11 @@ def test_a_rerun_keeps_the_rows_that_are_there(tmp_path, monkeypatch):
 
     monkeypatch.setattr(ablation, "run", run)
     options = ablation.Options(
-        tasks=("pendulum-explore",), rows=("all parts", "a steady hand"), out=tmp_path / "a.json"
+        tasks=("pendulum-explore",), rows=("all parts", "the plan alone"), out=tmp_path / "a.json"
     )
     ablation.main(replace(options, rows=("all parts",)))
     ablation.main(options)
-    assert done == ["all parts", "a steady hand"]
+    assert done == ["all parts", "the plan alone"]
     rows = json.loads(options.out.read_text(encoding="utf-8"))["rows"]
     assert [row["arm"] for row in rows] == done
 

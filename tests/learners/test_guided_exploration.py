@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import envs
+from torch_gprl.critics import graphs, kernels_by_name
 from torch_gprl.learners import PolicyGradient, PolicyGradientConfig
 from torch_gprl.policies import ConfidenceNoise, GibbsPolicy
 
@@ -112,3 +113,13 @@ def test_what_does_not_go_together_is_refused(options, message, monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as users run it, without the hook
     with pytest.raises(ValueError, match=message):
         PolicyGradientConfig(**options)
+
+
+def test_a_graph_of_states_and_actions_follows_a_policy_that_asks_the_critic_on_it(monkeypatch):
+    monkeypatch.setattr(kernels_by_name, "LOOKAHEAD_OF_ACTIONS", 2)
+    numbers = {"kernel": "successor-actions", "targets": "differences", "visited": 20, "rollout_steps": 6}
+    trained = learner("gibbs", updates=1, **numbers)  # 40 steps, hence four updates
+    for figures in trained.train():
+        assert figures["gradient_norm"].isfinite().all()
+    (graph,) = graphs(trained.critic)
+    assert int(graph.size) == 20  # the newest of 24 since it was cleared

@@ -166,7 +166,8 @@ def store_transitions(
             if policy is None:
                 raise ValueError("a graph of states and actions needs a policy to act in the next states")
             next_action = action_moments(policy, following)[0]
-            _follow_policy(graph, critic, policy, action.shape[-1])
+            if int(graph.size):
+                _follow_policy(graph, critic, policy, action.shape[-1])
         states = critic.inputs(transitions.get(critic.in_keys[0]), action)[..., :dims]
         next_states = critic.inputs(following.get(critic.in_keys[0]), next_action)[..., :dims]
         terminated = following.get("terminated").reshape(states.shape[:-1])

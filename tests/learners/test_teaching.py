@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import envs
-from torch_gprl.critics import EstimatorName, KernelName
+from torch_gprl.critics import EstimatorName, KernelName, kernels_by_name
 from torch_gprl.gp import AgeAwareScore
 from torch_gprl.learners import PolicyGradient, PolicyGradientConfig, teaching
 from torch_gprl.learners.config import BY_STATE_VALUES, Optimiser
@@ -62,6 +62,7 @@ def test_every_optimiser_moves_the_policy(optimiser):
 )
 def test_every_kernel_serves(name, targets, monkeypatch):
     monkeypatch.setattr(teaching, "FIRST_FIT", 8)
+    monkeypatch.setattr(kernels_by_name, "LOOKAHEAD_OF_ACTIONS", 3)
     made = learner(2, kernel=name, targets=targets, visited=120)
     for figures in made.train():
         assert (figures["gradient_norm"] > 0).all()

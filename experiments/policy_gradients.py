@@ -149,14 +149,14 @@ def draw(curves: dict[str, Metrics], title: str) -> Figure:
     figure.suptitle(title)
     *panels, legend = figure.subplots(2, 3).flat
     for axes, (key, label) in zip(panels, PANELS.items(), strict=True):
-        for name, arm in curves.items():
+        for place, (name, arm) in enumerate(curves.items()):
             if key not in arm:
                 continue
             smooth = _moving_mean(arm[key])
             frames = arm["frames"][len(arm["frames"]) - len(smooth) :, 0]
             low, high = bootstrap_interval(smooth)
-            (line,) = axes.plot(frames, smooth.mean(axis=1), label=name, linewidth=1.5)
-            axes.fill_between(frames, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+            axes.plot(frames, smooth.mean(axis=1), color=f"C{place}", label=name, linewidth=1.5)
+            axes.fill_between(frames, low, high, color=f"C{place}", alpha=0.2, linewidth=0)
         axes.set(xlabel="environment steps per learner", ylabel=label)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25, linewidth=0.5)

@@ -76,6 +76,7 @@ class Regressor:
         slopes.set_prior("bias_variance", LogNormal(-1.0, 2.0))
         self.kernel: Kernel = self.bends + slopes
         self.log_noise = torch.full(batch, math.log(FIRST_NOISE), dtype=torch.float64)
+        self._first = [value.detach().clone() for value in (*self.kernel.parameters(), self.log_noise)]
 
     def solve(self, inputs: Float[Tensor, "L N D"], targets: Float[Tensor, "L N T"], fit: bool) -> None:
         """Learn all data anew, with new hyper-parameters if asked."""
@@ -99,22 +100,31 @@ class Regressor:
         return left.clamp(max=1.0)
 
     def _fit(self, inputs: Tensor, targets: Tensor) -> None:
-        """Maximise the evidence of all targets together, from where the last fit ended."""
+        """Maximise the evidence of all targets together, afresh: what little data said can mislead.
+
+        A learner keeps what it has where that explains the data better.
+        """
         parameters = [*self.kernel.parameters(), self.log_noise]
         before = [value.detach().clone() for value in parameters]
         self.log_noise.requires_grad_(True)
         optimiser = torch.optim.Adam(parameters, lr=0.1)
+        better = torch.zeros(len(inputs), dtype=torch.bool, device=inputs.device)
         try:
+            with torch.no_grad():
+                evidence = self._log_evidence(inputs, targets)
+                for value, first in zip(parameters, self._first, strict=True):
+                    value.copy_(first)
             for _ in range(FIT_STEPS):
                 optimiser.zero_grad()
                 (-self._log_evidence(inputs, targets).sum()).backward()
                 optimiser.step()
                 self.log_noise.data.clamp_(min=math.log(NOISE_FLOOR))
-            self._log_evidence(inputs, targets)  # the last step may have gone too far
+            better = self._log_evidence(inputs, targets).detach() >= evidence
         except CholeskyError:
-            with torch.no_grad():
-                for value, old in zip(parameters, before, strict=True):
-                    value.copy_(old)
+            pass  # nobody's are better
+        with torch.no_grad():
+            for value, old in zip(parameters, before, strict=True):
+                value.copy_(torch.where(better.view(-1, *[1] * (value.ndim - 1)), value, old))
         self.log_noise.requires_grad_(False)
 
     def _log_evidence(self, inputs: Tensor, targets: Tensor) -> Float[Tensor, " L"]:

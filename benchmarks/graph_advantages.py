@@ -3,9 +3,9 @@
     python -m benchmarks.graph_advantages [--batches 4] [--minutes 8] [--out runs/graph-advantages]
 
 At the fixed policies of `gradient_quality` on Pendulum-v1, critics learn batches of some episodes by temporal
-differences, as the learner of policy gradients does; then their advantages are compared with those of brute
-force. Correlations are appended to advantages.jsonl in --out; the same command goes on where it was stopped,
-and then leaves graph_advantages.json and a picture.
+differences, as the learner of policy gradients does: as a stream, or all at once from a replay buffer. Then
+their advantages are compared with those of brute force. Correlations are appended to advantages.jsonl in
+--out; the same command goes on where it was stopped, and then leaves graph_advantages.json and a picture.
 """
 
 import dataclasses
@@ -20,13 +20,19 @@ import torch
 import tyro
 from matplotlib.figure import Figure
 
-from benchmarks.gradient_arms import fit_gaussian
+from benchmarks.gradient_arms import at_once, fit_gaussian
 from benchmarks.gradient_data import SETTINGS, STEPS, Batches, Fixed, batches, fixed_policies
 from benchmarks.gradient_truth import Branches, branches
 from torch_gprl.critics import KernelName
 from torch_gprl.learners import PolicyGradientConfig
 
-KERNELS: tuple[KernelName, ...] = ("squared-exponential", "matern-3/2", "successor", "successor-actions")
+ARMS: tuple[tuple[KernelName, bool], ...] = (  # kernel, and whether all is solved at once
+    ("squared-exponential", False),
+    ("squared-exponential", True),
+    ("matern-3/2", False),
+    ("successor", False),
+    ("successor-actions", False),
+)
 BRANCHES_SEED, DATA_SEED = 3_000_000, 7
 LENGTHSCALE = 0.5  # of observations, in their standard deviations times √columns
 NOISE = 1e-2  # of the variance of rewards
@@ -37,7 +43,7 @@ class Options:
     """What to compare."""
 
     batches: int = 4  # independent ones, each with critics of its own
-    episodes: tuple[int, ...] = (5, 20, 50)  # of a batch
+    episodes: tuple[int, ...] = (5, 20, 50, 100)  # of a batch
     budgets: tuple[int, ...] = (200, 600)  # basis vectors
     minutes: float = math.inf  # after which to stop, to go on by the same command
     out: Path = field(default_factory=lambda: Path("runs/graph-advantages"))  # where results and policies go
@@ -51,6 +57,7 @@ class Case:
     kernel: KernelName
     budget: int
     episodes: int
+    at_once: bool = False
     correlation: tuple[float, ...] = ()
 
 
@@ -75,8 +82,8 @@ def complete(fixed: Fixed, records: Path, until: float, options: Options) -> Non
         missing = [
             case
             for budget in options.budgets
-            for kernel in KERNELS
-            if (case := Case(title, kernel, budget, episodes)) not in done
+            for kernel, all_at_once in ARMS
+            if (case := Case(title, kernel, budget, episodes, all_at_once)) not in done
         ]
         if not missing or time.monotonic() > until:
             continue
@@ -102,6 +109,8 @@ def correlations(case: Case, fixed: Fixed, seen: Batches, truth: Branches) -> tu
         noise=NOISE,
         visited=seen.data[0].numel(),
     )
+    if case.at_once:
+        numbers = dataclasses.replace(at_once(seen, numbers), solved=seen.data[0].numel())
     return tuple(round(value, 3) for value in truth.correlation(fit_gaussian(seen, numbers)).tolist())
 
 
@@ -109,7 +118,8 @@ def read_cases(records: Path) -> list[Case]:
     """All that was found so far."""
     lines = records.read_text().splitlines() if records.exists() else []
     rows = (json.loads(line) for line in lines)
-    return [Case(**row | {"correlation": tuple(row["correlation"])}) for row in rows]
+    cases = [Case(**row | {"correlation": tuple(row["correlation"])}) for row in rows]
+    return sorted(cases, key=lambda case: (case.policy, case.kernel, case.budget, case.episodes))
 
 
 def draw(cases: list[Case], path: Path) -> None:
@@ -119,13 +129,16 @@ def draw(cases: list[Case], path: Path) -> None:
     panels = figure.subplots(1, len(policies), squeeze=False, sharey=True)[0]
     most = max(case.budget for case in cases)
     for axes, policy in zip(panels, policies, strict=True):
-        for index, kernel in enumerate(KERNELS):
+        for index, arm in enumerate(ARMS):
             for budget in dict.fromkeys(case.budget for case in cases):
-                rows = [c for c in cases if (c.policy, c.kernel, c.budget) == (policy, kernel, budget)]
+                rows = [
+                    c for c in cases if (c.policy, (c.kernel, c.at_once), c.budget) == (policy, arm, budget)
+                ]
                 steps = [case.episodes * STEPS for case in rows]
                 means = [statistics.fmean(case.correlation) for case in rows]
-                style, label = ("-", kernel) if budget == most else ("--", None)
-                axes.plot(steps, means, f"o{style}", color=f"C{index}", label=label, markersize=4)
+                label = arm[0] + (", all at once" if arm[1] else "")
+                style = {"label": label} if budget == most else {"linestyle": "--", "alpha": 0.6}
+                axes.plot(steps, means, marker="o", color=f"C{index}", markersize=4, **style)
         axes.set(xscale="log", xlabel="steps of experience", title=policy)
         axes.grid(alpha=0.25, linewidth=0.5)
     panels[0].set_ylabel("correlation of advantages with the truth")

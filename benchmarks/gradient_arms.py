@@ -67,9 +67,10 @@ ARMS = (
     Arm("GPTD all-action, replay", "five", "all-action"),
     Arm("5 batches, remembered states", "five", "all-action", remembered=True),
     Arm("10 batches, remembered states", "ten", "all-action", remembered=True),
+    Arm("20 batches, remembered states", "twenty", "all-action", remembered=True),
     Arm("all-action, best critic", "pooled", "all-action"),
 )
-REPLAYED = {"five": 5, "ten": 10}  # batches, by the critic that solves their differences
+REPLAYED = {"five": 5, "ten": 10, "twenty": 20}  # batches, by the critic that solves their differences
 POOLED = 40  # batches
 GAUSSIAN = ("returns", "differences", *REPLAYED, "pooled")  # processes as critics
 AT_ONCE = {"targets": "differences", "lengthscale": 0.5, "noise": 0.001}  # where all differences are solved

@@ -36,7 +36,7 @@ OTHERS = [
 COMMON = "--learners 2 --num-envs 2 --logger csv --checkpoint-interval"
 
 
-# Forked from a process that has imported everything and runs no threads, which a fork of this one would hang on.
+# Forks of a process that has imported everything and runs no threads: a fork of this one could hang on them.
 SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(["train"])
 

@@ -51,7 +51,7 @@ def admit_data(
         mask = _one_per_input("mask", mask, inputs).to(torch.bool)
         inputs = torch.where(mask.unsqueeze(-1), inputs, 0.0)
         targets = torch.where(mask, targets, 0.0)
-    if not math.isfinite(_size(inputs) + _size(targets)):  # details only on failure
+    if not _seem_finite(inputs, targets):  # details only on failure
         for name, tensor in (("inputs", inputs), ("targets", targets)):
             refuse_non_finite(name, tensor)
     return inputs, targets, mask
@@ -86,12 +86,13 @@ def admit_successors(
     return GaussianInputs(mean, variance, next_inputs.columns), rate
 
 
-def _size(tensor: Tensor) -> float:
-    """A number that is not finite if an entry is not: one synchronisation; on the CPU NumPy's is cheaper."""
-    if tensor.device.type != "cpu":
-        return float(tensor.sum())
-    array = tensor.detach().numpy()
-    return float(np.vdot(array, array))
+def _seem_finite(inputs: Tensor, targets: Tensor) -> bool:
+    """False if an entry is not finite, or numbers are huge; one synchronisation with the device."""
+    if inputs.device.type != "cpu":
+        return math.isfinite(float(inputs.sum() + targets.sum()))
+    # NumPy's calls cost less
+    arrays = (tensor.detach().numpy() for tensor in (inputs, targets))
+    return math.isfinite(sum(float(np.vdot(array, array)) for array in arrays))
 
 
 def _one_per_input(name: str, tensor: Tensor, inputs: Tensor) -> Tensor:

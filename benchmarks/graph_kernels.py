@@ -25,6 +25,7 @@ from benchmarks.graph_machines import Atwood, CartPole, Jump, Spiral
 from benchmarks.graph_maze import Maze
 from benchmarks.graph_pictures import draw_connectivity, draw_graph, draw_surfaces
 from benchmarks.graph_report import Score, show, write_summary
+from benchmarks.graph_spread import error_file, keep_errors
 from benchmarks.graph_systems import System, Trajectories, Truth, experience, true_values
 from torch_gprl.gp import Posterior
 from torch_gprl.graphs import NearestEdges, ThresholdEdges, TransitionGraph
@@ -89,8 +90,8 @@ def main(options: Options) -> None:
     for problem in problems:
         complete(problem, records, until, options)
     scores = read_scores(records)
-    write_summary(scores, options.out / "graph_kernels.json")
-    show(scores)
+    write_summary(scores, options.out)
+    show(scores, options.out)
 
 
 def complete(problem: System, records: Path, until: float, options: Options) -> None:
@@ -109,9 +110,10 @@ def complete(problem: System, records: Path, until: float, options: Options) -> 
         if time.monotonic() > until:
             return
         seen = experience(problem, truth, seed, options.trajectories, options.steps, TARGET_NOISE)
-        found = [
-            score(problem, truth, seed, learned) for learned in learn(kernel, truth, seen, seed, options)
-        ]
+        learned = list(learn(kernel, truth, seen, seed, options))
+        errors = {one.budget: one.posterior.mean - truth.values for one in learned}
+        keep_errors(error_file(options.out, problem.name, kernel, seed), errors)
+        found = [score(problem, truth, seed, one) for one in learned]
         with records.open("a") as file:
             file.write("".join(json.dumps(asdict(s), ensure_ascii=False) + "\n" for s in found))
         print(

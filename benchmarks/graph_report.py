@@ -12,10 +12,12 @@ from rich.table import Table
 from scipy.stats import t
 
 from benchmarks.graph_arms import EUCLIDEAN
+from benchmarks.graph_spread import Inner, error_file, inner_products, split, variance_ratio
 
 DIGITS = 4
+SPREADS = ("squared_bias", "variance", "variance_in_parts")
 COLUMNS = (
-    *("seeds", "RMSE", "spread", "gain", "± 95 %", "near", "far"),
+    *("seeds", "RMSE", "spread", "gain", "± 95 %", "bias²", "variance", "parts", "near", "far"),
     *("NLPD", "gain", "± 95 %", "tune s", "learn s", "predict s"),
 )
 
@@ -37,11 +39,12 @@ class Score:
     predicting: float  # s, for all states that are judged
 
 
-def show(scores: list[Score]) -> None:
+def show(scores: list[Score], folder: Path) -> None:
     """Print means over seeds, and what each kernel gains over the best Euclidean one."""
     for problem, budget in dict.fromkeys((s.problem, s.budget) for s in scores):
         by_kernel = _by_kernel(scores, problem, budget)
         table = Table("kernel", *COLUMNS, title=f"{problem}, {budget} basis vectors")
+        spreads = _spreads(by_kernel, folder)
         for kernel, runs in by_kernel.items():
             spread = statistics.stdev(s.rmse for s in runs) if len(runs) > 1 else math.nan
             error, fewer = paired_gain(by_kernel, kernel, "rmse"), paired_gain(by_kernel, kernel, "nlpd")
@@ -53,8 +56,9 @@ def show(scores: list[Score]) -> None:
             gained = f"{error.mean / best:+.0%}", f"± {error.half / best:.0%}"
             density = f"{_mean(runs, 'nlpd'):.2f}", f"{fewer.mean:+.2f}", f"± {fewer.half:.2f}"
             shown = f"{_mean(runs, 'rmse'):.3f}", f"{spread:.3f}"
-            table.add_row(kernel, str(len(runs)), *shown, *gained, near, far, *density, *seconds)
-        Console(width=160).print(table)
+            parts = [str(spreads.get(kernel, {}).get(key, "")) for key in SPREADS]
+            table.add_row(kernel, str(len(runs)), *shown, *gained, *parts, near, far, *density, *seconds)
+        Console(width=190).print(table)
 
 
 class Gain(NamedTuple):
@@ -77,19 +81,45 @@ def paired_gain(by_kernel: dict[str, list[Score]], kernel: str, key: str) -> Gai
     return Gain(statistics.fmean(spared), float(t.ppf(0.975, len(spared) - 1)) * error)
 
 
-def write_summary(scores: list[Score], path: Path) -> None:
-    """One line for each problem, budget and kernel: the errors of all seeds, and mean seconds."""
+def write_summary(scores: list[Score], folder: Path) -> None:
+    """graph_kernels.json: for each problem, budget and kernel the errors of all seeds, and mean seconds."""
     lines = []
     for problem, budget in dict.fromkeys((s.problem, s.budget) for s in scores):
-        for kernel, runs in _by_kernel(scores, problem, budget).items():
+        by_kernel = _by_kernel(scores, problem, budget)
+        spreads = _spreads(by_kernel, folder)
+        for kernel, runs in by_kernel.items():
             errors = {
                 key: [round(getattr(s, key), DIGITS) for s in runs]
                 for key in ("rmse", "rmse_near", "rmse_far", "nlpd")
             }
             seconds = {key: round(_mean(runs, key), 3) for key in ("tuning", "learning", "predicting")}
             named = {"problem": problem, "budget": budget, "kernel": kernel, "seeds": [s.seed for s in runs]}
-            lines.append(json.dumps({**named, **errors, **seconds}, ensure_ascii=False))
-    path.write_text("[\n" + ",\n".join(lines) + "\n]\n")
+            line = {**named, **errors, **spreads.get(kernel, {}), **seconds}
+            lines.append(json.dumps(line, ensure_ascii=False))
+    (folder / "graph_kernels.json").write_text("[\n" + ",\n".join(lines) + "\n]\n")
+
+
+def _spreads(by_kernel: dict[str, list[Score]], folder: Path) -> dict[str, dict[str, object]]:
+    """Squared bias and variance of each kernel, the latter also in parts of the best Euclidean kernel's.
+
+    That is the one of the least mean RMSE: a prior that hardly learns has no variance. With its interval,
+    where both have learned from the same seeds, of which there must be two.
+    """
+    inner = {name: _inner_products(runs, folder) for name, runs in by_kernel.items() if len(runs) > 1}
+    rivals = [name for name in inner if name in EUCLIDEAN]
+    best = min(rivals, key=lambda name: _mean(by_kernel[name], "rmse"), default=None)
+    found: dict[str, dict[str, object]] = {}
+    for name, products in inner.items():
+        bias, variance = split(products)
+        found[name] = {"squared_bias": round(bias, DIGITS + 1), "variance": round(variance, DIGITS + 1)}
+        if best and [s.seed for s in by_kernel[name]] == [s.seed for s in by_kernel[best]]:
+            ratio = variance_ratio(products, inner[best])
+            found[name]["variance_in_parts"] = [round(number, 2) for number in ratio]
+    return found
+
+
+def _inner_products(runs: list[Score], folder: Path) -> Inner:
+    return inner_products([error_file(folder, s.problem, s.kernel, s.seed) for s in runs], runs[0].budget)
 
 
 def _by_kernel(scores: list[Score], problem: str, budget: int) -> dict[str, list[Score]]:

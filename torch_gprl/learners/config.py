@@ -97,7 +97,7 @@ class PolicyGradientConfig:
     novelty_threshold: float = 0.3  # novelty that makes a point a basis vector, in noise variances
     renew_every: int = 20  # policy updates between renewals of the critic, which forget older data; 1: each
     replay: int = 0  # newest environment steps per learner to keep and solve anew at each update; 0: none
-    solved: int = 4_000  # of these, most that are solved at once; more are thinned evenly
+    solved: int = 4_000  # of these, most that are solved at once: those farthest apart
     improvements: int = 0  # further steps at each update, by the critic at replayed states; with "all-action"
     noise: float = 0.02  # noise variance of temporal differences, in variances of the reward
     lengthscale: float = 0.3  # of observations, in their standard deviations times √columns; differences

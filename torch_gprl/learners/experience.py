@@ -9,7 +9,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from jaxtyping import Int
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer
 
 
@@ -29,16 +31,17 @@ class Experience:
         """Transitions of each learner."""
         return len(self._buffer)
 
-    def extend(self, transitions: TensorDictBase) -> None:
-        """Add transitions [learners, N], the same entries each time.
+    def extend(self, transitions: TensorDictBase) -> Int[Tensor, " N"]:
+        """Add transitions [learners, N], the same entries each time; where they stand in `all`.
 
         Raises:
             OSError: the disk has no room for the files.
         """
         first = not len(self)
-        self._buffer.extend(transitions.transpose(0, 1))
+        rows = self._buffer.extend(transitions.transpose(0, 1))
         if first and self._folder is not None:
             _reserve(self._folder)
+        return rows
 
     def all(self) -> TensorDictBase:
         """The transitions [learners, N], oldest first until some have given way."""

@@ -9,7 +9,7 @@ import math
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
@@ -25,6 +25,7 @@ from torch_gprl.critics import (
 )
 from torch_gprl.critics.difference_equations import Transitions
 from torch_gprl.gp import AgeAwareScore, InformationScore, SparseOnlineGP, fit_hyperparameters
+from torch_gprl.graphs.covering import farthest_points
 from torch_gprl.learners.config import PolicyGradientConfig
 from torch_gprl.learners.experience import Experience
 from torch_gprl.policies import GaussianPolicy
@@ -81,6 +82,7 @@ class Teacher:
         self.policy: ProbabilisticTensorDictSequential = policy
         self.experience = Experience(config.replay) if config.replay else None
         self.fresh = 0  # transitions of each learner since the basis was chosen
+        self.solved: Int[Tensor, "learners steps"] | None = None  # rows of the experience; None: all of them
 
     def teach(self, rollout: TensorDictBase, update: int) -> None:
         """Absorb a rollout [learners, envs, T] with `value_target`, made at policy update `update`."""
@@ -108,7 +110,7 @@ class Teacher:
         """Add a rollout to the experience; where much of it is new, scale and cover it anew."""
         assert self.experience is not None
         transitions = rollout.select(*REMEMBERED).reshape(rollout.shape[0], -1)
-        self.experience.extend(transitions)
+        self._choose_solved(self.experience.extend(transitions))
         self.fresh += transitions.shape[1]
         if self.fresh < RENEWED_SHARE * len(self.experience):
             store_transitions(self.critic, rollout, self.policy)
@@ -123,12 +125,34 @@ class Teacher:
         critic.cover(observation, action, _lengthscale(*dims, self.config).to(critic.input_loc))
 
     def _remembered(self) -> TensorDictBase:
-        """Experience [learners, steps], evenly thinned to what is solved at once.
+        """What is solved of the experience, [learners, steps]."""
+        assert self.experience is not None
+        every = self.experience.all()
+        if self.solved is None:
+            return every
+        some = every.gather(1, self.solved)
+        assert isinstance(some, TensorDictBase)
+        return some
 
-        Old experience stays for what the policy no longer visits: forgetting that ends in a relapse.
+    def _choose_solved(self, new: Int[Tensor, " N"]) -> None:
+        """Of what was solved so far and the new rows of the experience, keep those farthest from each other.
+
+        A policy that does well visits little. Thinned evenly, most of what is kept would be there, and errors
+        of the values elsewhere would end in a relapse.
         """
         assert self.experience is not None
-        return _spread_over(self.experience.all(), self.config.solved)
+        count, every = self.config.solved, self.experience.all()
+        if every.shape[1] <= count:
+            return
+        rows = torch.arange(every.shape[1], device=new.device) if self.solved is None else new
+        rows = rows.expand(every.shape[0], -1)
+        if self.solved is not None:
+            rows = torch.cat([self.solved, rows], 1)
+        some = every.gather(1, rows)
+        inputs = self.critic.inputs(some.get("observation"), some.get("action"))
+        spread = inputs.std(-2, keepdim=True)
+        chosen = farthest_points(inputs / torch.where(spread > 1e-6, spread, 1.0), count).chosen
+        self.solved = rows.gather(1, chosen.sort(-1).values)
 
     @torch.no_grad()
     def _scale_values(self, remembered: TensorDictBase) -> None:
@@ -193,6 +217,7 @@ class Teacher:
             "critic": self.critic.state_dict(),
             "experience": None if self.experience is None else self.experience.state_dict(),
             "fresh": self.fresh,
+            "solved": self.solved,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -200,7 +225,7 @@ class Teacher:
         self.critic.load_state_dict(state["critic"])
         if self.experience is not None:
             self.experience.load_state_dict(state["experience"])
-        self.fresh = state["fresh"]
+        self.fresh, self.solved = state["fresh"], state["solved"]
 
 
 def _lengthscale(states: int, actions: int, config: PolicyGradientConfig) -> Float[Tensor, " D"]:

@@ -201,3 +201,22 @@ def test_learners_pull_back_apart_and_nothing_seen_changes_nothing():
         alone = Experience(2, 80, 10)
         alone.add(batch.states[learner, batch.mask], batch.next_states[learner, batch.mask])
         torch.testing.assert_close(alone.pulled_back(lengthscale, 0.9), found[learner])
+
+
+def test_folds_leave_whole_trajectories_out_and_never_all():
+    experience = Experience(2, 80, 10)
+    experience.add(*trajectories(6, 12))
+    number = torch.arange(80) // 12
+    for fold, kept in enumerate(experience.without_folds(3)):
+        assert torch.equal(kept, experience.mask & (number % 3 != fold))
+    alone = Experience(2, 80, 10)
+    alone.add(*trajectories(1, 12))
+    assert all(torch.equal(kept, alone.mask) for kept in alone.without_folds(3))
+
+
+def test_a_trajectory_of_states_and_actions_goes_on_though_another_action_was_taken():
+    states, next_states = trajectories(4, 12)
+    actions, next_actions = torch.randn(2, 48, 1, dtype=torch.float64)
+    experience = Experience(3, 80, 10)
+    experience.add(torch.cat([states, actions], -1), torch.cat([next_states, next_actions], -1))
+    assert torch.equal(experience.without_folds(2)[0], experience.mask & (torch.arange(80) // 12 % 2 == 1))

@@ -20,12 +20,13 @@ from torch_gprl.kernels.graph import TableKernel
 
 DISCOUNT = 0.9
 ROTATION = torch.tensor([[0.9, -0.3], [0.3, 0.9]], dtype=torch.float64)
+STEPS = 8  # of a trajectory
 Make = Callable[[Experience], TableKernel]
 
 KINDS: dict[str, Make] = {
     "geodesic": lambda experience: GeodesicKernel(experience, DISCOUNT, 0.8, 1.3, 4),
     "successor": lambda experience: SuccessorKernel(experience, DISCOUNT, 0.8, 1.3, 0),
-    "successor, ahead": lambda experience: SuccessorKernel(experience, DISCOUNT, 0.8, 1.3, 5),
+    "successor, ahead": lambda experience: SuccessorKernel(experience, DISCOUNT, 0.8, 1.3, 3),
 }
 
 
@@ -34,7 +35,7 @@ def make(request: pytest.FixtureRequest) -> Make:
     return KINDS[request.param]
 
 
-def trajectories(count: int = 5, steps: int = 8, *batch: int) -> tuple[Tensor, Tensor]:
+def trajectories(count: int = 5, steps: int = STEPS, *batch: int) -> tuple[Tensor, Tensor]:
     """States and next states of a linear system, trajectory after trajectory: [*batch, count · steps, 2]."""
     path = [torch.randn(*batch, count, 2, dtype=torch.float64)]
     for _ in range(steps):
@@ -89,7 +90,7 @@ def test_gradients_in_the_parameters_agree_with_finite_differences(make: Make):
 
 def test_gradients_in_the_inputs_agree_with_finite_differences(make: Make):
     kernel = make(filled())
-    arguments = inputs(4).requires_grad_(), inputs(3).requires_grad_()
+    arguments = inputs(2).requires_grad_(), inputs(2).requires_grad_()
     assert torch.autograd.gradcheck(kernel, arguments, atol=1e-4)
 
 
@@ -152,11 +153,24 @@ def test_between_states_that_only_distance_joins_a_short_geodesic_is_the_distanc
 
 
 def dense_successors(experience: Experience, landmarks: Tensor) -> Tensor:
-    """M K_r(·, Z) of every visited state, by a dense inverse; no trajectory's end is followed ahead."""
+    """M K_r(·, Z) of every visited state, by a dense inverse; no trajectory's end is followed ahead.
+
+    Ends borrow from three committee members, each of which lacks every third trajectory.
+    """
     size = int(experience.size)
     step = torch.zeros(size, size, dtype=torch.float64)
     rows = torch.arange(size).unsqueeze(-1).expand(size, experience.interpolate)
-    step.index_put_((rows, experience.after_nodes[:size]), experience.after_weights[:size], accumulate=True)
+    for fold in range(3):
+        kept = torch.arange(experience.capacity) // STEPS % 3 != fold
+        after = experience.nearest(experience.next_states[:size], kept & experience.mask)
+        nodes, weights = (
+            torch.where(experience.ends[:size, None], of_end, inside[:size])
+            for of_end, inside in (
+                (after.nodes, experience.after_nodes),
+                (after.weight, experience.after_weights),
+            )
+        )
+        step.index_put_((rows, nodes), weights / 3, accumulate=True)
     step[experience.terminated[:size]] = 0
     rewards = SquaredExponential(2, 0.8)(experience.states[:size], landmarks)
     return torch.linalg.inv(torch.eye(size, dtype=torch.float64) - DISCOUNT * step) @ rewards
@@ -219,6 +233,23 @@ def test_where_the_nearest_states_disagree_the_prior_stays_wide():
     assert undecided(between) > 0.05
     kernel.doubt = 2 * kernel.doubt.detach()
     assert undecided(visited) < 1e-9
+
+
+def test_what_one_trajectory_tells_is_doubted_more_than_what_three_tell():
+    """All roads lead down but the topmost, which alone leads up; an input beside it may do either."""
+    steps = torch.linspace(0, 4, 13, dtype=torch.float64)
+
+    def undecided(upward: int) -> float:
+        roads = [torch.stack([steps, 0.1 - 0.01 * k + 0.3 * steps**2], -1) for k in range(upward)]
+        roads += [torch.stack([steps, -0.3 - 0.05 * k - 0.3 * steps**2], -1) for k in range(6)]
+        experience = Experience(2, 120, 40, interpolate=2)
+        experience.add(*(torch.cat([road[part] for road in roads]) for part in (slice(-1), slice(1, None))))
+        kernel, x = SuccessorKernel(experience, DISCOUNT, 1.0, 1.0, 6), torch.tensor([[0.1, 0.095]]).double()
+        kernel.doubt = 1e-9
+        return float((kernel.features(x)[1].square() / kernel.diag(x)).detach())
+
+    assert undecided(1) > 0.05
+    assert undecided(3) < 0.01
 
 
 def test_a_mixture_averages_its_rest_and_takes_experience_at_the_mean():

@@ -175,14 +175,30 @@ class Experience(nn.Module):
         # some twice if there are too few
         self.landmarks.copy_(chosen[..., torch.arange(self.landmarks.shape[-1]) % chosen.shape[-1]])
 
-    def nearest(self, x: Float[Tensor, "*#batch N D"]) -> Neighbours:
-        """The visited states that speak for x [*batch, N, D]."""
-        units = self.lengthscale.unsqueeze(-2)
-        return neighbours(x / units, self.states / units, self.mask, self.interpolate)
+    def without_folds(self, count: int) -> list[Bool[Tensor, "*batch C"]]:
+        """All transitions but those of one fold of the trajectories, for each of `count` folds.
 
-    def successor(self, x: Float[Tensor, "*#batch N D"]) -> Successor:
+        Where nothing else is left, all transitions. A trajectory goes on where half of the columns of a row
+        are those that the row before it arrives at: a graph of states and actions stores the policy's action
+        there, not the one that was taken.
+        """
+        same = self.next_states[..., :-1, :] == self.states[..., 1:, :]
+        number = nn.functional.pad((same.double().mean(-1) < 0.5).cumsum(-1), (1, 0))
+        kept = [self.mask & (number % count != fold) for fold in range(count)]
+        return [torch.where(some.any(-1, keepdim=True), some, self.mask) for some in kept]
+
+    def nearest(
+        self, x: Float[Tensor, "*#batch N D"], among: Bool[Tensor, "*#batch C"] | None = None
+    ) -> Neighbours:
+        """The visited states that speak for x [*batch, N, D]; of those in `among`, if given."""
+        units, used = self.lengthscale.unsqueeze(-2), self.mask if among is None else among
+        return neighbours(x / units, self.states / units, used, self.interpolate)
+
+    def successor(
+        self, x: Float[Tensor, "*#batch N D"], among: Bool[Tensor, "*#batch C"] | None = None
+    ) -> Successor:
         """Where x [*batch, N, D] is expected to go: x' of its neighbours, corrected by their slopes."""
-        found = self.nearest(x)
+        found = self.nearest(x, among)
         offset = x.unsqueeze(-2) - gather_rows(self.states, found.nodes)
         slopes = gather_rows(self.slopes.flatten(-2), found.nodes).unflatten(-1, self.slopes.shape[-2:])
         arrivals = gather_rows(self.next_states, found.nodes) + (slopes @ offset.unsqueeze(-1)).squeeze(-1)

@@ -6,9 +6,11 @@ Directed, and positive semi-definite by construction. The features M φ are Daya
 representation; as a prior of values it is that of Engel et al. (2005) with the transitions known.
 
 Inputs off the graph are followed ahead: x, its expected successor, and so on, for some steps before the last
-one borrows from the vertices near it. That is what finds the side of a ridge on which an input lies. Where
-these vertices disagree, the variance that their average loses is kept, and so is a part of that of the
-vertices nearest to the input itself: near a ridge the prior stays wide.
+one borrows from the vertices near it. That is what finds the side of a ridge on which an input lies. It is a
+hard decision, which one trajectory more or less may turn round. So a committee takes it, each member of which
+lacks a fold of the trajectories (Parmanto, Munro and Doyle, 1996). Where its members, or the vertices that
+they end at, disagree, the variance that the average loses is kept, and so is a part of that of the vertices
+nearest to the input itself: near a ridge the prior stays wide. Inputs on the graph went where they went.
 
 | paper | here | meaning |
 |---|---|---|
@@ -20,14 +22,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import csc_array, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
 from torch_gprl.graphs.experience import Experience
-from torch_gprl.graphs.interpolation import Neighbours
+from torch_gprl.graphs.interpolation import COINCIDENT, Neighbours
 from torch_gprl.kernels.distance import log_gaussian
 from torch_gprl.kernels.graph import SMALLEST_REST, Factors, Remembered, Table, TableKernel, exponential
 from torch_gprl.kernels.graph_geodesic import check_discount
@@ -36,6 +38,7 @@ from torch_gprl.linalg import cholesky
 from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
 
 FIRST_DOUBT = 0.1  # until it is set or fitted
+FOLDS = 3  # of the trajectories: each member of the committee lacks another
 
 
 class Way(NamedTuple):
@@ -43,8 +46,16 @@ class Way(NamedTuple):
 
     points: list[Float[Tensor, "*batch N D"]]  # of each step: x, its successor, and so on
     weights: list[Float[Tensor, "*batch N"]]  # γ^t times the part that has not ended; of one step more
-    start: Neighbours  # of x
     end: Neighbours  # of the point that the last step reaches
+
+
+class Ways(NamedTuple):
+    """How inputs stand to the graph, and where those off it go."""
+
+    start: Neighbours
+    off: Bool[Tensor, "*batch N"]  # the graph
+    rows: Int[Tensor, " R"]  # off the graph for some learner
+    committee: list[Way]  # of these rows, one from each member
 
 
 class SuccessorKernel(TableKernel):
@@ -52,7 +63,8 @@ class SuccessorKernel(TableKernel):
 
     It knows nothing where there is no experience, and the transitions of others are a guess: add an ordinary
     kernel, `SuccessorKernel(…) + Matern(…)`, for what it cannot tell. A further parameter, `doubt`, is the
-    part of the disagreement of the nearest states that following an input ahead does not settle.
+    part of the disagreement of the nearest states that following an input ahead does not settle. A visited
+    state keeps its vertex: there the kernel is no smooth function of its inputs.
 
     Args:
         experience: visited states and transitions; may grow at any time.
@@ -88,7 +100,7 @@ class SuccessorKernel(TableKernel):
         self.experience = experience
         self.discount = discount
         self.lookahead = lookahead
-        self._ways: Remembered[Way] = Remembered()
+        self._remembered_ways: Remembered[Ways] = Remembered()
 
     def forward(self, x: Inputs, z: OtherInputs) -> CrossMatrix:
         """Covariance of x [*batch, N, D] with z [*batch, M, D]: [*batch, N, M]."""
@@ -124,45 +136,68 @@ class SuccessorKernel(TableKernel):
         """Mφ of every vertex: Mφ(x) = φ(x) + γ Mφ(x'), the ends of trajectories followed ahead."""
         visited = self.experience
         rewards = self._reward_features(visited.states, landmarks, inverse)
-        nodes, weights = visited.after_nodes.clone(), visited.after_weights.clone()
         going = self.discount * (~visited.terminated).to(inverse.dtype)
         rows = visited.ends.reshape(-1, visited.capacity).any(0).nonzero().flatten()  # an end of any learner
-        ends = visited.ends[..., rows]
-        way = self._way(visited.next_states[..., rows, :])
-        ahead, left = self._along(way, landmarks, inverse), way.weights[-1]
-        rewards = rewards.index_add(-2, rows, (going[..., rows] * ends).unsqueeze(-1) * ahead)
-        going[..., rows] *= torch.where(ends, left, 1.0)
-        nodes[..., rows, :] = torch.where(ends.unsqueeze(-1), way.end.nodes, nodes[..., rows, :])
-        weights[..., rows, :] = torch.where(ends.unsqueeze(-1), way.end.weight, weights[..., rows, :])
-        return _resolve(nodes, weights * going.unsqueeze(-1), rewards)
+        ends = visited.ends[..., rows].unsqueeze(-1)
+        ways = self._follow(visited.next_states[..., rows, :])
+        nodes, weights = [], []
+        for way in ways:
+            ahead = going[..., rows].unsqueeze(-1) * ends * self._along(way, landmarks, inverse)
+            rewards = rewards.index_add(-2, rows, ahead / len(ways))
+            left = way.end.weight * way.weights[-1].unsqueeze(-1)
+            nodes.append(_with_rows(visited.after_nodes, rows, ends, way.end.nodes))
+            weights.append(_with_rows(visited.after_weights, rows, ends, left) / len(ways))
+        return _resolve(torch.cat(nodes, -1), torch.cat(weights, -1) * going.unsqueeze(-1), rewards)
 
     def _build_features(self, x: Tensor, table: Table) -> Factors:
         """F [*batch, N, L], and the root of the variance that is left undecided [*batch, N, 1]."""
+        ways, vertices = self._ways(x), table[-1]
+        features, spread_here = _agreement(ways.start, vertices)
+        off = ways.off[..., ways.rows].unsqueeze(-1)
+        followed, undecided = self._followed(ways.committee, table)
+        features = _with_rows(features, ways.rows, off, followed)
+        undecided = _with_rows(torch.zeros_like(spread_here), ways.rows, off, undecided)
+        undecided = undecided + self.doubt[..., None, None] * spread_here
+        return features, undecided.clamp_min(SMALLEST_REST).sqrt()
+
+    def _followed(self, ways: list[Way], table: Table) -> tuple[Tensor, Tensor]:
+        """Features that all ways lead to on average, and the variance that they disagree about."""
         landmarks, inverse, vertices = table
-        way = self._way(x)
-        left = way.weights[-1].unsqueeze(-1)
-        average, spread = _agreement(way.end, vertices)
-        _, spread_here = _agreement(way.start, vertices)
-        undecided = left.square() * spread + self.doubt[..., None, None] * spread_here
-        return self._along(way, landmarks, inverse) + left * average, undecided.clamp_min(
-            SMALLEST_REST
-        ).sqrt()
+        found, variance = [], []
+        for way in ways:
+            left = way.weights[-1].unsqueeze(-1)
+            average, spread = _agreement(way.end, vertices)
+            found.append(self._along(way, landmarks, inverse) + left * average)
+            variance.append(left.square() * spread)
+        features, within = torch.stack(found), torch.stack(variance).mean(0)
+        average = features.mean(0)
+        return average, within + (features - average).square().sum(-1, keepdim=True).mean(0)
 
-    def _way(self, x: Tensor) -> Way:
-        """The expected way from x, found once while a fit tries many parameters."""
+    def _ways(self, x: Tensor) -> Ways:
+        """The expected ways from x, found once while a fit tries many parameters."""
         if torch.is_grad_enabled() and x.requires_grad:
-            return self._follow(x)
-        return self._ways.find(x, self.experience.buffers(), self._follow)
+            return self._find_ways(x)
+        return self._remembered_ways.find(x, self.experience.buffers(), self._find_ways)
 
-    def _follow(self, x: Tensor) -> Way:
+    def _find_ways(self, x: Tensor) -> Ways:
+        start = self.experience.nearest(x)
+        off = start.distance[..., 0] > COINCIDENT
+        rows = off.reshape(off.shape[:-1].numel(), off.shape[-1]).any(0).nonzero().flatten()
+        return Ways(start, off, rows, self._follow(x[..., rows, :]))
+
+    def _follow(self, x: Tensor) -> list[Way]:
+        """The way from x by each member of the committee."""
+        return [self._follow_among(x, known) for known in self.experience.without_folds(FOLDS)]
+
+    def _follow_among(self, x: Tensor, known: Tensor) -> Way:
         batch = torch.broadcast_shapes(x.shape[:-2], self.batch_shape)
         here, weight = x, x.new_ones(*batch, x.shape[-2])
         points, weights = [], [weight]
         for _ in range(self.lookahead):
             points.append(here)
-            here, alive = self.experience.successor(here)
+            here, alive = self.experience.successor(here, known)
             weights.append(weights[-1] * self.discount * alive)
-        return Way(points, weights, self.experience.nearest(x), self.experience.nearest(here))
+        return Way(points, weights, self.experience.nearest(here, known))
 
     def _along(self, way: Way, landmarks: Tensor, inverse: Tensor) -> Tensor:
         """Discounted φ along the way, summed up to its last step."""
@@ -173,6 +208,11 @@ class SuccessorKernel(TableKernel):
 
     def _reward_features(self, x: Tensor, landmarks: Tensor, inverse: Tensor) -> Tensor:
         return log_gaussian(x, landmarks, self.log_lengthscale).exp() @ inverse.mT
+
+
+def _with_rows(values: Tensor, rows: Tensor, where: Tensor, new: Tensor) -> Tensor:
+    """Values [*batch, N, R], with others [*batch, rows, R] in some rows where a mask says so."""
+    return values.index_copy(-2, rows, torch.where(where, new, values[..., rows, :]))
 
 
 def _agreement(found: Neighbours, values: Tensor) -> tuple[Tensor, Tensor]:

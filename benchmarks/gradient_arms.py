@@ -85,13 +85,13 @@ class Critics(NamedTuple):
 
 
 def fit_critics(
-    earlier: Batches, several: Batches, pooled: GPActionValue, numbers: PolicyGradientConfig
+    earlier: Batches, several: Batches | None, pooled: GPActionValue, numbers: PolicyGradientConfig
 ) -> Critics:
     """All critics: fitted on one earlier batch for each learner, on several, and the one that serves all.
 
     Args:
         earlier: one batch for each learner.
-        several: as many as the largest of `REPLAYED` for each learner.
+        several: as many as the largest of `REPLAYED` for each learner; none, and no critic learns them.
         pooled: critic of very many batches.
         numbers: of the critics that learn one batch.
     """
@@ -99,9 +99,10 @@ def fit_critics(
         "returns": fit_gaussian(earlier, numbers),
         "differences": fit_gaussian(earlier, dataclasses.replace(numbers, targets="differences")),
     }
-    for name, count in REPLAYED.items():
-        replayed = first(several, count)
-        gaussian[name] = fit_gaussian(replayed, at_once(replayed, numbers))
+    if several is not None:
+        for name, count in REPLAYED.items():
+            replayed = first(several, count)
+            gaussian[name] = fit_gaussian(replayed, at_once(replayed, numbers))
     gaussian["pooled"] = pooled
     return Critics(gaussian, fit_neural(earlier, numbers))
 
@@ -160,14 +161,14 @@ def evaluations(new: Batches, critics: Critics, discount: float) -> dict[str, Ev
 
 
 def gradients(
-    arm: Arm, new: Batches, several: Batches, critics: Critics, seen: dict[str, Evaluation]
+    arm: Arm, new: Batches, several: Batches | None, critics: Critics, seen: dict[str, Evaluation]
 ) -> Float[Tensor, "L P"]:
     """The arm's gradient estimate from each batch: ascent direction, mean over steps."""
     weight = ESTIMATORS[arm.estimator](
         dataclasses.replace(seen[arm.critic], horizon=arm.horizon, trace=arm.trace)
     )
     critic = critics.gaussian[arm.critic] if arm.estimator in USE_ALL_ACTIONS else None
-    if not arm.remembered:
+    if not arm.remembered or several is None:
         return ascent(new.data, new.policy, weight, critic)
     both = TensorDict.cat([first(several, REPLAYED[arm.critic]).data, new.data], 1)
     assert isinstance(both, TensorDict)

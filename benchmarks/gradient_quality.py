@@ -1,6 +1,6 @@
 """How good are policy gradients from small batches? Noise, bias and both, for every estimator (Claim 1).
 
-    python -m benchmarks.gradient_quality [--quick] [--batches 200] [--task Pendulum-v1]
+    python -m benchmarks.gradient_quality [--quick] [--batches 200] [--several 40] [--task Pendulum-v1]
 
 At fixed policies, every estimator sees the same independent batches of 5 episodes of 200 steps; its critic
 was fitted on one earlier batch, or on several ("replay", "remembered"). The reference is the mean over many
@@ -56,6 +56,7 @@ class Options:
 
     quick: bool = False  # 40 batches on the first task alone: shows that it works, not how good it is
     batches: int = 200  # independent batches of every policy
+    several: int = 40  # of these, that critics of several earlier batches see too: those take minutes
     reference_batches: int = 800  # further ones, for the reference gradient
     task: str | None = None  # one task instead of all
     budget: int = 300  # basis vectors of the critics that learn one batch
@@ -87,10 +88,17 @@ def main(options: Options) -> None:
 
 
 class Comparison(NamedTuple):
-    """Figures of all estimators at one policy; correlation of each critic's advantages with the true ones."""
+    """Figures of all estimators at one policy, each from so many batches; what is known of the critics.
+
+    Args:
+        estimators: figures, by the arm's label.
+        advantages: correlation with the true ones, by the critic.
+        batches: how many there were, by the arm's label.
+    """
 
     estimators: dict[str, Quality]
     advantages: dict[str, float]
+    batches: dict[str, int]
 
 
 def compare(fixed: Fixed, options: Options) -> Comparison:
@@ -102,15 +110,23 @@ def compare(fixed: Fixed, options: Options) -> Comparison:
         records.recall(f"reference-{seed}", partial(sides.reference, seed))["gradient"]
         for seed in _seeds(options.reference_batches, 1_000_000)
     ]
+    several = set(_seeds(min(options.several, options.batches), 0))
     groups = [
         records.recall(f"batches-{seed}", partial(sides.estimates, seed))
+        if seed in several
+        else records.recall(f"one-earlier-{seed}", partial(sides.estimates, seed, several=False))
         for seed in _seeds(options.batches, 0)
     ]
     print(f"{options.batches} batches in {time.monotonic() - started:.0f} s", flush=True)
     aim = torch.cat(reference).mean(0)
+    found = {
+        name: torch.cat([group[name] for group in groups if name in group])
+        for name in (*(arm.label for arm in ARMS), *GAUSSIAN)
+    }
     return Comparison(
-        {arm.label: quality(torch.cat([group[arm.label] for group in groups]), aim) for arm in ARMS},
-        {name: float(torch.cat([group[name] for group in groups]).mean()) for name in GAUSSIAN},
+        {arm.label: quality(found[arm.label], aim) for arm in ARMS},
+        {name: float(found[name].mean()) for name in GAUSSIAN},
+        {arm.label: len(found[arm.label]) for arm in ARMS},
     )
 
 
@@ -157,14 +173,20 @@ class Sides:
         """True advantages."""
         return branches(self.fixed, BRANCHES_SEED)
 
-    def estimates(self, seed: int) -> dict[str, Tensor]:
-        """Every arm's gradient for each batch; each critic's correlation with the true advantages."""
-        earlier = batches(self.fixed, SIDE_BY_SIDE, seed)
-        several = batches(self.fixed, SIDE_BY_SIDE, seed + 2, max(REPLAYED.values()) * EPISODES)
-        critics = fit_critics(earlier, several, self.pooled, self.numbers)
+    def estimates(self, seed: int, several: bool = True) -> dict[str, Tensor]:
+        """Every arm's gradient for each batch; each critic's correlation with the true advantages.
+
+        Args:
+            seed: of the batches.
+            several: whether critics learn several earlier batches too; else their arms are left out.
+        """
+        earlier, before = batches(self.fixed, SIDE_BY_SIDE, seed), None
+        if several:
+            before = batches(self.fixed, SIDE_BY_SIDE, seed + 2, max(REPLAYED.values()) * EPISODES)
+        critics = fit_critics(earlier, before, self.pooled, self.numbers)
         new = batches(self.fixed, SIDE_BY_SIDE, seed + 1)
         seen = evaluations(new, critics, self.discount)
-        made = {arm.label: gradients(arm, new, several, critics, seen) for arm in ARMS}
+        made = {arm.label: gradients(arm, new, before, critics, seen) for arm in ARMS if arm.critic in seen}
         return made | {name: self.truth.correlation(critic) for name, critic in critics.gaussian.items()}
 
     def reference(self, seed: int) -> dict[str, Tensor]:
@@ -184,13 +206,13 @@ def _seeds(total: int, first: int) -> Iterator[int]:
 def show(title: str, results: Comparison) -> None:
     """Print the table of one policy."""
     print(f"\n{title}: batches of {EPISODES} × {STEPS} steps\n")
-    print(f"| {'estimator':26s} | nsr (95 % interval)      | cosM | cosB | relMSE  |")
-    print(f"|{'-' * 28}|--------------------------|------|------|---------|")
+    print(f"| {'estimator':29s} | nsr (95 % interval)      | cosM | cosB | relMSE  | batches |")
+    print(f"|{'-' * 31}|--------------------------|------|------|---------|---------|")
     for label, found in results.estimators.items():
         value, low, high = found.nsr.tolist()
         noise = f"{value:8.3g} ({low:.3g} to {high:.3g})"
         rest = f"{found.cos_mean[0]:.2f} | {found.cos_batch[0]:.2f} | {found.relative_mse[0]:7.3g}"
-        print(f"| {label:26s} | {noise:24s} | {rest} |")
+        print(f"| {label:29s} | {noise:24s} | {rest} | {results.batches[label]:7d} |")
     correlations = ", ".join(f"{name} {value:.2f}" for name, value in results.advantages.items())
     print(f"\ncorrelation of estimated and true advantage, by critic: {correlations}", flush=True)
 
@@ -202,7 +224,8 @@ def write(results: dict[str, Comparison], out: Path) -> None:
         title: {
             "advantage correlation": table.advantages,
             "estimators": {
-                label: {
+                label: {"batches": table.batches[label]}
+                | {
                     name: dict(zip(("value", "low", "high"), t.tolist(), strict=True))
                     for name, t in q._asdict().items()
                 }

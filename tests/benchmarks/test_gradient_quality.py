@@ -8,6 +8,8 @@ import torch
 import envs
 from benchmarks.gradient_arms import (
     ARMS,
+    GAUSSIAN,
+    REPLAYED,
     at_once,
     evaluations,
     first,
@@ -17,6 +19,7 @@ from benchmarks.gradient_arms import (
     quality,
 )
 from benchmarks.gradient_data import EPISODES, SETTINGS, STEPS, Batches, Fixed, batches
+from benchmarks.gradient_quality import SIDE_BY_SIDE, Options, Records, compare
 from benchmarks.gradient_truth import ACTIONS, STATES, Branches, branches
 from torch_gprl.critics import EstimatorName, GPActionValue
 from torch_gprl.gp import SparseOnlineGP
@@ -83,6 +86,24 @@ def test_every_arm_gives_a_gradient_for_every_batch(made):
         found = gradients(arm, new, earlier, critics, seen)
         assert found.shape[0] == LEARNERS
         assert (found.norm(dim=1) > 0).all()
+    alone = fit_critics(earlier, None, pooled, NUMBERS)
+    assert alone.gaussian.keys() == critics.gaussian.keys() - REPLAYED.keys()
+
+
+def test_each_arm_is_judged_by_the_batches_that_it_saw(tmp_path, monkeypatch):
+    def recall(records: Records, name: str, make: object) -> dict[str, torch.Tensor]:
+        if name.startswith("reference"):
+            return {"gradient": torch.ones(SIDE_BY_SIDE, 2).double()}
+        dear = REPLAYED if name.startswith("one-earlier") else ()
+        labels = [arm.label for arm in ARMS if arm.critic not in dear] + [*set(GAUSSIAN) - {*dear}]
+        return {label: torch.randn(SIDE_BY_SIDE, 2).double() for label in labels}
+
+    monkeypatch.setattr(Records, "recall", recall)
+    one = SIDE_BY_SIDE
+    found = compare(untrained(), Options(batches=3 * one, several=one, reference_batches=one, out=tmp_path))
+    for arm in ARMS:
+        assert found.batches[arm.label] == one * (1 if arm.critic in REPLAYED else 3)
+        assert found.estimators[arm.label].nsr[0] > 0
 
 
 def test_a_critic_that_replays_solves_every_step_on_a_basis_that_grows_with_them(made):

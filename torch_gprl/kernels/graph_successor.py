@@ -55,7 +55,7 @@ class Ways(NamedTuple):
     start: Neighbours
     off: Bool[Tensor, "*batch N"]  # the graph
     rows: Int[Tensor, " R"]  # off the graph for some learner
-    committee: list[Way]  # of these rows, one from each member
+    committee: list[Way]  # of these rows, one from each member; none for no rows
 
 
 class SuccessorKernel(TableKernel):
@@ -153,11 +153,12 @@ class SuccessorKernel(TableKernel):
         """F [*batch, N, L], and the root of the variance that is left undecided [*batch, N, 1]."""
         ways, vertices = self._ways(x), table[-1]
         features, spread_here = _agreement(ways.start, vertices)
-        off = ways.off[..., ways.rows].unsqueeze(-1)
-        followed, undecided = self._followed(ways.committee, table)
-        features = _with_rows(features, ways.rows, off, followed)
-        undecided = _with_rows(torch.zeros_like(spread_here), ways.rows, off, undecided)
-        undecided = undecided + self.doubt[..., None, None] * spread_here
+        undecided = self.doubt[..., None, None] * spread_here
+        if ways.committee:
+            off = ways.off[..., ways.rows].unsqueeze(-1)
+            followed, disputed = self._followed(ways.committee, table)
+            features = _with_rows(features, ways.rows, off, followed)
+            undecided = undecided + _with_rows(torch.zeros_like(undecided), ways.rows, off, disputed)
         return features, undecided.clamp_min(SMALLEST_REST).sqrt()
 
     def _followed(self, ways: list[Way], table: Table) -> tuple[Tensor, Tensor]:
@@ -183,7 +184,7 @@ class SuccessorKernel(TableKernel):
         start = self.experience.nearest(x)
         off = start.distance[..., 0] > COINCIDENT
         rows = off.reshape(off.shape[:-1].numel(), off.shape[-1]).any(0).nonzero().flatten()
-        return Ways(start, off, rows, self._follow(x[..., rows, :]))
+        return Ways(start, off, rows, self._follow(x[..., rows, :]) if len(rows) else [])
 
     def _follow(self, x: Tensor) -> list[Way]:
         """The way from x by each member of the committee."""

@@ -3,7 +3,7 @@
     python -m benchmarks.exploration [--learner q-learning] [--tasks atwood] [--arms confidence] [--quick]
 
 Every arm has the same learner, environments and starts, learner by learner, so that arms are compared in
-pairs. The tuned noise is the best of four standard deviations on the very same seeds, which favours it. Each
+pairs. The tuned noise is the best of five standard deviations on the very same seeds, which favours it. Each
 finished group of learners is kept in --out; a second call runs what is missing. Leaves exploration.json and
 pictures there.
 """
@@ -39,6 +39,7 @@ class Options:
     tasks: tuple[str, ...] = ()  # all of the learner's unless named
     arms: tuple[str, ...] = ()  # all of the learner's unless named
     learners: int = 20  # paired seeds
+    first: int = 0  # the first of them: numbers that were chosen on some seeds are judged on others
     quick: bool = False  # a fifth of the steps, four learners: shows that it works, not who wins
     out: Path = field(default_factory=lambda: Path("runs/exploration"))  # where results go
 
@@ -76,11 +77,12 @@ def complete(setting: Setting, arm: str, options: Options, progress: Progress) -
         if σ is None:
             return
         numbers = {"exploration": "gaussian", "std": matching_std(setting, σ, options.out)}
-    for first in range(0, options.learners, GROUP):
+    last = options.first + options.learners
+    for first in range(options.first, last, GROUP):
         path = record_of(setting, arm, first, options.out)
         if path.exists():
             continue
-        learners = range(first, min(first + GROUP, options.learners))
+        learners = range(first, min(first + GROUP, last))
         bar = progress.add_task(f"{setting.name}, {arm}, learner {first} and on", total=frames)
         pictures = Snapshots(setting)
         for learner, outcome in run(setting, numbers, learners, frames):

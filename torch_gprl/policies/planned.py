@@ -47,7 +47,7 @@ class PlannedBehaviour:
     exploration: PlannedScheme = "optimism"  # round the planned action; torch_gprl.policies.planned
     std: float = 0.1  # standard deviation of noise at first, in halves of the actuator's range
     final_std: float | None = None  # the same at last, in equal steps; as at first unless told
-    noise_scale: float = 0.25  # confidence: σ² in squared halves of the range, where nothing is known
+    noise_scale: float = 0.05  # confidence: σ² in squared halves of the range, where nothing is known
     least_std: float = 0.05  # confidence: floor of σ, in halves of the actuator's range
     most_std: float = 1.0  # confidence: ceiling of σ, in halves of the actuator's range
     gibbs_form: EnergyForm = "robust"  # gibbs: the thesis' energy, or its sibling that stays near f(s)

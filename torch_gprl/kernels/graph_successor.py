@@ -8,9 +8,10 @@ representation; as a prior of values it is that of Engel et al. (2005) with the 
 Inputs off the graph are followed ahead: x, its expected successor, and so on, for some steps before the last
 one borrows from the vertices near it. That is what finds the side of a ridge on which an input lies. It is a
 hard decision, which one trajectory more or less may turn round. So a committee takes it, each member of which
-lacks a fold of the trajectories (Parmanto, Munro and Doyle, 1996). Where its members, or the vertices that
-they end at, disagree, the variance that the average loses is kept, and so is a part of that of the vertices
-nearest to the input itself: near a ridge the prior stays wide. Inputs on the graph went where they went.
+lacks a fold of the trajectories (Parmanto, Munro and Doyle, 1996) and looks ahead another time. Where its
+members, or the vertices that they end at, disagree, the variance that the average loses is kept, and so is a
+part of that of the vertices nearest to the input itself: near a ridge the prior stays wide. Inputs on the
+graph went where they went.
 
 | paper | here | meaning |
 |---|---|---|
@@ -38,7 +39,7 @@ from torch_gprl.linalg import cholesky
 from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
 
 FIRST_DOUBT = 0.1  # until it is set or fitted
-FOLDS = 3  # of the trajectories: each member of the committee lacks another
+MEMBERS = (0.5, 1.0, 2.0)  # of the committee: how far each follows, in parts of the lookahead
 
 
 class Way(NamedTuple):
@@ -71,7 +72,8 @@ class SuccessorKernel(TableKernel):
         discount: γ of the values that are learned, between 0 and 1.
         lengthscale: of rewards, in units of the inputs; broadcasts to [*batch, D].
         outputscale: σ², prior variance of values; broadcasts to [*batch].
-        lookahead: steps that an input off the graph is followed before it borrows from vertices.
+        lookahead: steps that an input off the graph is followed before it borrows from vertices, by one
+            member of the committee; half as many by another, twice as many by the third.
 
     Raises:
         ValueError: a discount outside (0, 1), or a negative lookahead.
@@ -188,13 +190,17 @@ class SuccessorKernel(TableKernel):
 
     def _follow(self, x: Tensor) -> list[Way]:
         """The way from x by each member of the committee."""
-        return [self._follow_among(x, known) for known in self.experience.without_folds(FOLDS)]
+        folds = self.experience.without_folds(len(MEMBERS))
+        return [
+            self._follow_among(x, known, int(part * self.lookahead))
+            for known, part in zip(folds, MEMBERS, strict=True)
+        ]
 
-    def _follow_among(self, x: Tensor, known: Tensor) -> Way:
+    def _follow_among(self, x: Tensor, known: Tensor, steps: int) -> Way:
         batch = torch.broadcast_shapes(x.shape[:-2], self.batch_shape)
         here, weight = x, x.new_ones(*batch, x.shape[-2])
         points, weights = [], [weight]
-        for _ in range(self.lookahead):
+        for _ in range(steps):
             points.append(here)
             here, alive = self.experience.successor(here, known)
             weights.append(weights[-1] * self.discount * alive)

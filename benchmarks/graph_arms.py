@@ -112,7 +112,6 @@ class Tuned:
         self.kernel = arm.kernel(self.graph, dims)
         start = time.perf_counter()
         kept = torch.arange(len(seen.targets)) % HELD_OUT != 0
-        grow(self.graph, seen, kept)
         held_out, targets = seen.states[~kept].flatten(0, 1), seen.targets[~kept].flatten()
         chosen = torch.randperm(len(targets))[:TUNING_POINTS]
 
@@ -121,18 +120,20 @@ class Tuned:
             fit_hyperparameters(gp, held_out[chosen], targets[chosen], steps, noise_floor=noise / 4)
             return gp.noise_variance.detach()
 
-        if not isinstance(self.graph, Experience):
-            self.noise = fit(self.kernel)
-        else:
-            ordinary = Matern(dims, smoothness=0.5)
+        ordinary = Matern(dims, smoothness=0.5)
+        if isinstance(self.kernel, SuccessorWithRest):
+            grow(self.graph, seen, torch.ones_like(kept))
             self.noise = fit(ordinary)
-            if isinstance(self.kernel, SuccessorWithRest):
-                grow(self.graph, seen, ~kept)
-                self.kernel.suit(ordinary.lengthscale, ordinary.outputscale)
-            else:
-                self.graph.measure(self.graph.pulled_back(ordinary.lengthscale.detach(), DISCOUNT))
-                self.noise = fit(self.kernel)
-                grow(self.graph, seen, ~kept)
+            self.kernel.suit(ordinary.lengthscale, ordinary.outputscale)
+        elif isinstance(self.graph, Experience):
+            grow(self.graph, seen, kept)
+            fit(ordinary)
+            self.graph.measure(self.graph.pulled_back(ordinary.lengthscale.detach(), DISCOUNT))
+            self.noise = fit(self.kernel)
+            grow(self.graph, seen, ~kept)
+        else:
+            grow(self.graph, seen, kept)
+            self.noise = fit(self.kernel)
         self.seconds = time.perf_counter() - start
 
     def together(self, budgets: Sequence[int]) -> list[Sequence[int]]:

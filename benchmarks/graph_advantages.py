@@ -15,6 +15,7 @@ import statistics
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import get_args
 
 import torch
 import tyro
@@ -45,6 +46,8 @@ class Options:
     batches: int = 4  # independent ones, each with critics of its own
     episodes: tuple[int, ...] = (5, 20, 50, 100)  # of a batch
     budgets: tuple[int, ...] = (200, 600)  # basis vectors
+    policies: tuple[str, ...] = ("mid", "good")
+    kernels: tuple[KernelName, ...] = ()  # names of those to compare; all unless told
     minutes: float = math.inf  # after which to stop, to go on by the same command
     out: Path = field(default_factory=lambda: Path("runs/graph-advantages"))  # where results and policies go
 
@@ -67,7 +70,8 @@ def main(options: Options) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     records, until = options.out / "advantages.jsonl", time.monotonic() + 60 * options.minutes
     for fixed in fixed_policies(SETTINGS[0], options.out / "policies"):
-        complete(fixed, records, until, options)
+        if fixed.name in options.policies:
+            complete(fixed, records, until, options)
     found = read_cases(records)
     lines = ",\n".join(json.dumps(dataclasses.asdict(case)) for case in found)
     (options.out / "graph_advantages.json").write_text(f"[\n{lines}\n]\n")
@@ -83,7 +87,8 @@ def complete(fixed: Fixed, records: Path, until: float, options: Options) -> Non
             case
             for budget in options.budgets
             for kernel, all_at_once in ARMS
-            if (case := Case(title, kernel, budget, episodes, all_at_once)) not in done
+            if kernel in (options.kernels or get_args(KernelName))
+            and (case := Case(title, kernel, budget, episodes, all_at_once)) not in done
         ]
         if not missing or time.monotonic() > until:
             continue
@@ -110,7 +115,7 @@ def correlations(case: Case, fixed: Fixed, seen: Batches, truth: Branches) -> tu
         visited=seen.data[0].numel(),
     )
     if case.at_once:
-        numbers = dataclasses.replace(at_once(seen, numbers), solved=seen.data[0].numel())
+        numbers = dataclasses.replace(at_once(seen, numbers), budget=case.budget)
     return tuple(round(value, 3) for value in truth.correlation(fit_gaussian(seen, numbers)).tolist())
 
 

@@ -1,6 +1,6 @@
 """How good are policy gradients from small batches? Noise, bias and both, for every estimator (Claim 1).
 
-    python -m benchmarks.gradient_quality [--quick] [--batches 200] [--several 40] [--task Pendulum-v1]
+    python -m benchmarks.gradient_quality [--quick] [--batches 200] [--several 20] [--task Pendulum-v1]
 
 At fixed policies, every estimator sees the same independent batches of 5 episodes of 200 steps; its critic
 was fitted on one earlier batch, or on several ("replay", "remembered"). The reference is the mean over many
@@ -56,7 +56,7 @@ class Options:
 
     quick: bool = False  # 40 batches on the first task alone: shows that it works, not how good it is
     batches: int = 200  # independent batches of every policy
-    several: int = 40  # of these, that critics of several earlier batches see too: those take minutes
+    several: int = 20  # of these, that critics of several earlier batches see too: those take minutes
     reference_batches: int = 800  # further ones, for the reference gradient
     task: str | None = None  # one task instead of all
     budget: int = 300  # basis vectors of the critics that learn one batch

@@ -177,8 +177,9 @@ def draw_sigma(setting: Setting, taken: dict[str, Any], path: Path) -> None:
     chosen = np.unique(np.linspace(0, len(taken["sigma"]) - 1, MOMENTS).round().astype(int))
     figure = Figure(figsize=(3.2 * len(chosen), 3), layout="constrained")
     panels = np.ravel(figure.subplots(1, len(chosen)))
+    most = max(taken["sigma"][index].max().item() for index in chosen)
     for axes, index in zip(panels, chosen, strict=True):
-        image = _map(axes, setting, taken["sigma"][index].numpy(), vmin=0, vmax=1)
+        image = _map(axes, setting, taken["sigma"][index].numpy(), vmin=0, vmax=most)
         axes.set_title(f"{taken['frames'][index]:,} steps", fontsize="small")
     figure.colorbar(image, ax=list(panels), label="σ (halves of the range)")
     figure.supxlabel(setting.labels[0])

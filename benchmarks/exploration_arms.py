@@ -140,8 +140,8 @@ def _by_plans(task: str, frames: int, every: int, **numbers: float) -> Setting:
     )
 
 
-# rehearsals take two thirds of the time, and change little but on atwood; what counts as new is coarser than by
-# default where a robot can always go faster than it ever did
+# rehearsals take two thirds of the time, and change little but on atwood; what counts as new is coarser than
+# by default where a robot can always go faster than it ever did
 BY_PLANS = {
     "pendulum-explore": _by_plans("pendulum-explore", 700, 25, rehearsal=0, novelty_lengthscale=2.0),
     "MountainCarContinuous-v0": _by_plans("MountainCarContinuous-v0", 1_200, 100, rehearsal=0),

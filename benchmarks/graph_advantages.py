@@ -9,6 +9,7 @@ their advantages are compared with those of brute force. Correlations are append
 """
 
 import dataclasses
+import itertools
 import json
 import math
 import statistics
@@ -82,19 +83,20 @@ def complete(fixed: Fixed, records: Path, until: float, options: Options) -> Non
     """Append what is missing of a policy, the least experience first."""
     title = f"{fixed.name} policy (return {fixed.mean_return:.0f})"
     done = {dataclasses.replace(case, correlation=()) for case in read_cases(records)}
-    for episodes in options.episodes:
-        missing = [
-            case
-            for budget in options.budgets
-            for kernel, all_at_once in ARMS
-            if kernel in (options.kernels or get_args(KernelName))
-            and (case := Case(title, kernel, budget, episodes, all_at_once)) not in done
-        ]
-        if not missing or time.monotonic() > until:
-            continue
-        truth = branches(fixed, BRANCHES_SEED)
+    missing = [
+        case
+        for episodes in options.episodes
+        for budget in options.budgets
+        for kernel, all_at_once in ARMS
+        if kernel in (options.kernels or get_args(KernelName))
+        and (case := Case(title, kernel, budget, episodes, all_at_once)) not in done
+    ]
+    if not missing or time.monotonic() > until:
+        return
+    truth = branches(fixed, BRANCHES_SEED)
+    for episodes, cases in itertools.groupby(missing, key=lambda case: case.episodes):
         seen = batches(fixed, options.batches, DATA_SEED, episodes)
-        for case in missing:
+        for case in cases:
             if time.monotonic() > until:
                 return
             found = dataclasses.replace(case, correlation=correlations(case, fixed, seen, truth))

@@ -66,6 +66,7 @@ def variance_ratio(inner: Inner, other: Inner) -> Ratio:
     """Variance in parts of another kernel's on the same seeds."""
     seeds = len(inner)
     counts = np.random.default_rng(0).multinomial(seeds, np.full(seeds, 1 / seeds), size=RESAMPLES)
+    counts = counts[(counts > 0).sum(-1) > 1]  # one seed alone has no variance
     ratios = _split(inner, counts)[1] / _split(other, counts)[1]
     low, high = np.quantile(ratios, [TAIL, 1 - TAIL])
     return Ratio(split(inner).variance / split(other).variance, float(low), float(high))

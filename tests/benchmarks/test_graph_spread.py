@@ -33,6 +33,11 @@ def test_a_variance_in_parts_of_another_is_paired_by_seed(tmp_path: Path):
     assert variance_ratio(one, other) == pytest.approx((0.25, 0.25, 0.25), rel=1e-4)
 
 
+def test_three_seeds_are_enough_for_an_interval(tmp_path: Path):
+    one, other = (kept(tmp_path, torch.randn(3, 40), name) for name in ("one", "other"))
+    assert np.isfinite(variance_ratio(one, other)).all()
+
+
 def test_intervals_of_a_ratio_cover_the_truth_as_often_as_they_say(tmp_path: Path):
     """Twenty seeds, true ratio 1.5: of 50 intervals 47.5 cover it on average, 41 or more with 99.9 %."""
     rng = np.random.default_rng(3)

@@ -105,6 +105,7 @@ ALL_ACTION_REPLAY: dict[str, object] = {
     "targets": "differences",
     "exploration": "fixed",
     "replay": 13_000,
+    "solved": 3_000,
     "improvements": 10,
     "damping": 0.05,
     "noise": 0.001,

@@ -1,7 +1,7 @@
 """What each number gives: all-action policy gradients on Pendulum-v1 from batches of 200 steps.
 
     python -m benchmarks.gradient_levers                            every lever for 3,000 environment steps
-    python -m benchmarks.gradient_levers --levers "as preset" --frames 13000 --episodes 100
+    python -m benchmarks.gradient_levers --levers "as preset" --frames 13000 --learners 20 --episodes 100
 
 The preset of `train.py` for this task, and the same with one number changed. After every batch, 40 steps of
 five environments (later every fifth), the deterministic policy plays the same starts, those of Gymnasium's
@@ -43,7 +43,7 @@ LEVERS: dict[str, dict[str, Any]] = {
     "learned exploration": {"exploration": "learned"},
     "discount 0.98": {"discount": 0.98},
     "the newest 1,000 steps alone": {"replay": 1_000},
-    "the newest 4,000, noise 0.005": {"replay": 4_000, "noise": 0.005},
+    "the newest 4,000, noise 0.005": {"replay": 4_000, "solved": 4_000, "noise": 0.005},
     "noise of differences 0.02": {"noise": 0.02},
     "state length scales 0.3": {"lengthscale": 0.3},
     "unit action length scale": {"action_lengthscale": 1.0},

@@ -124,3 +124,12 @@ def test_a_kernel_in_single_precision_gives_the_same_to_single_precision(make: M
 def test_single_precision_inputs_are_computed_with_in_double(make: Make):
     x, z = points(6).float(), points(4).float()
     torch.testing.assert_close(make(())(x, z), make(())(x.double(), z.double()))
+
+
+def test_an_expansion_is_the_weighted_sum_of_covariances_and_differentiable(make: Make):
+    kernel, z, weights = make((2,)), points(2, 4), torch.randn(2, 4, 3, dtype=torch.float64)
+    x = points(2, 5).requires_grad_(True)
+    theirs, ours = kernel(x, z) @ weights, kernel.expansion(z, weights)(x)
+    torch.testing.assert_close(ours, theirs, rtol=1e-10, atol=1e-12)
+    slopes = [torch.autograd.grad(values.sum(), x)[0] for values in (ours, theirs)]
+    torch.testing.assert_close(*slopes, rtol=1e-8, atol=1e-10)

@@ -39,13 +39,14 @@ class SparseRegression:
         self._precision_factor = cholesky(eye + weighted @ phi.mT)
         weights = torch.cholesky_solve(weighted @ targets, self._precision_factor)
         self.coefficients = torch.linalg.solve_triangular(self._gram_factor.mT, weights, upper=True)
+        self._mean = kernel.expansion(basis, self.coefficients)
 
     def _features(self, inputs: Tensor) -> Tensor:
         return torch.linalg.solve_triangular(self._gram_factor, self._against(inputs), upper=False)
 
     def mean(self, inputs: Float[Tensor, "*batch N D"]) -> Float[Tensor, "*batch N T"]:
         """Posterior means at inputs [*batch, N, D]."""
-        return self._against(inputs).mT @ self.coefficients
+        return self._mean(inputs)
 
     @torch.no_grad()
     def variance(self, inputs: Float[Tensor, "*batch N D"]) -> Float[Tensor, "*batch N"]:

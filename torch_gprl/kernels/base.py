@@ -73,6 +73,14 @@ class Kernel(nn.Module, ABC):
             return self._expected(x, other)
         return self(x.mean, other.mean)
 
+    def expansion(self, z: OtherInputs, weights: Tensor) -> Callable[[Inputs], Tensor]:
+        """The functions x ↦ Σ_m k(x, z_m) w_m [*batch, N, T] of weights [*batch, M, T]: posterior means.
+
+        Differentiable in x alone, with what does not depend on x computed beforehand.
+        """
+        against, weights = self.against(z), weights.detach()
+        return lambda x: against(x).mT @ weights
+
     def expected_pairs(self, x: GaussianInputs, z: GaussianInputs) -> PerPoint:
         """E[k(x_i, z_i)] of each row of x with the same row of z, independent draws: [*batch, N].
 
@@ -192,6 +200,11 @@ class Sum(_Composite):
     def against(self, z: OtherInputs) -> Callable[[Inputs], CrossMatrix]:
         """The function x ↦ k(z, x), with what each part computes beforehand; see `Kernel.against`."""
         parts = [kernel.against(z) for kernel in self.parts]
+        return lambda x: reduce(add, (part(x) for part in parts))
+
+    def expansion(self, z: OtherInputs, weights: Tensor) -> Callable[[Inputs], Tensor]:
+        """The sum of what each part makes of the same weights; see `Kernel.expansion`."""
+        parts = [kernel.expansion(z, weights) for kernel in self.parts]
         return lambda x: reduce(add, (part(x) for part in parts))
 
     def diag(self, x: Inputs) -> PerPoint:

@@ -50,6 +50,12 @@ class Linear(Kernel):
         bias = self.bias_variance[..., None, None].detach()
         return lambda x: weighted @ x.to(weighted.dtype).mT + bias
 
+    def expansion(self, z: OtherInputs, weights: Tensor) -> Callable[[Inputs], Tensor]:
+        """The functions x ↦ Σ_m k(x, z_m) w_m: straight lines; see `Kernel.expansion`."""
+        slopes = ((z * self.slope_variance.unsqueeze(-2)).mT @ weights).detach()
+        offset = (self.bias_variance[..., None, None] * weights.sum(-2, keepdim=True)).detach()
+        return lambda x: x.to(slopes.dtype) @ slopes + offset
+
     def diag(self, x: Inputs) -> PerPoint:
         """Prior variance at x [*batch, N, D]: [*batch, N]."""
         return (x.square() * self.slope_variance.unsqueeze(-2)).sum(-1) + self.bias_variance[..., None]

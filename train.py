@@ -111,11 +111,26 @@ ALL_ACTION_REPLAY: dict[str, object] = {
     "noise": 0.001,
     "lengthscale": 1.0,
 }
+# The same from whole rollouts, where values are rougher: a basis vector for every five steps that are solved, and
+# a noise that keeps them from being learned by heart.
+ALL_EXPERIENCE: dict[str, object] = {
+    "total_frames": 12_000,
+    "estimator": "all-action",
+    "targets": "differences",
+    "replay": 12_000,
+    "solved": 3_000,
+    "budget": 600,
+    "improvements": 4,
+    "damping": 0.05,
+    "noise": 0.1,
+    "lengthscale": 0.5,
+}
 # A rollout holds whole episodes, and values look ahead as far as the task's steps are short.
 POLICY_GRADIENT_PRESETS: dict[str, dict[str, object]] = {
     "Pendulum-v1": ALL_ACTION_REPLAY,
     "pendulum-explore": {"discount": 0.97},
-    "cartpole-balance": {"rollout_steps": 500, "discount": 0.99},
+    "atwood": ALL_EXPERIENCE,
+    "cartpole-balance": ALL_EXPERIENCE | {"rollout_steps": 500, "discount": 0.99},
     "cartpole-swingup": {"rollout_steps": 250, "total_frames": 300_000},
     "InvertedPendulum-v5": {"rollout_steps": 1000, "discount": 0.99},
     "HalfCheetah-v5": {"rollout_steps": 1000, "total_frames": 1_000_000, "discount": 0.99},

@@ -160,7 +160,7 @@ DIFFERENCES = {"targets": "differences", "estimator": "all-action"}
 
 @pytest.mark.parametrize(
     "numbers",
-    [DIFFERENCES, DIFFERENCES | {"replay": 150, "solved": 60, "improvements": 1}, {"critic": "neural"}],
+    [DIFFERENCES, DIFFERENCES | {"replay": 150, "solved": 60, "improvements": 3}, {"critic": "neural"}],
     ids=str,
 )
 def test_a_saved_run_goes_on_as_it_would_have(numbers):

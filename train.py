@@ -111,8 +111,8 @@ ALL_ACTION_REPLAY: dict[str, object] = {
     "noise": 0.001,
     "lengthscale": 1.0,
 }
-# The same from whole rollouts, where values are rougher: a basis vector for every five steps that are solved, and
-# a noise that keeps them from being learned by heart.
+# The same from whole rollouts, where values are rougher: a basis vector for every five steps that are solved,
+# and a noise that keeps them from being learned by heart.
 ALL_EXPERIENCE: dict[str, object] = {
     "total_frames": 12_000,
     "estimator": "all-action",

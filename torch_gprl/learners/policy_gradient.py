@@ -8,7 +8,7 @@ the critic. All learners at once, each on its own experience.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -32,7 +32,6 @@ from torch_gprl.objectives import (
     natural_step,
     split_episodes,
     step_along,
-    trusted_share,
 )
 from torch_gprl.policies import (
     ConfidenceNoise,
@@ -89,7 +88,6 @@ class PolicyGradient:
         self.frames_per_update = num_envs * config.rollout_steps
         self.total_updates = -(-config.total_frames // self.frames_per_update)
         self.updates = 0
-        self.share = torch.ones(self.learners, device=env.device)  # of the trust region, that a step may use
         self._last_return = torch.full((self.learners,), torch.nan, device=env.device)
 
     def _teacher(self, policy: GaussianPolicy, seed: int, first_learner: int) -> Teacher | NeuralTeacher:
@@ -155,9 +153,8 @@ class PolicyGradient:
             step = self._step_policy(rollout)
             if not taught:
                 self.teacher.teach(rollout, self.updates)
-            last_step = None
             for _ in range(self.config.improvements):
-                last_step = self._improve(last_step)
+                self._improve()
             self.updates += 1
             yield self._figures(rollout, seen) | step
 
@@ -187,34 +184,23 @@ class PolicyGradient:
         self._anneal((self.updates + 1) / self.total_updates)
         return figures
 
-    def _improve(self, last_step: Tensor | None) -> Tensor:
-        """One more step without new experience: the critic solved anew, all actions at remembered states.
-
-        Args:
-            last_step: what came before it in the same way [learners, P], if anything.
-
-        Returns:
-            the change of the parameters [learners, P].
-        """
+    def _improve(self) -> None:
+        """One more step without new experience: the critic solved anew, all actions at remembered states."""
         assert isinstance(self.teacher, Teacher)
         remembered, parameters = self.teacher.solve_anew(), self._trained()
         self.optimiser.zero_grad()
         self.losses[-1](remembered)["loss_all_action"].backward()
-        if last_step is not None:
-            self.share = trusted_share(self.share, _gradient(parameters), last_step)
-        before = _flat(parameters)
         self._move(remembered, parameters)
-        return _flat(parameters) - before
 
     def _move(self, rollout: TensorDictBase, parameters: list[torch.nn.Parameter]) -> None:
         """Step along the gradient that is set, at states of the rollout."""
         left = 1 - self.updates / self.total_updates
-        region = self.config.trust_region * left * self.share
         if self.config.optimiser == "natural":
-            natural_step(parameters, self._divergence(rollout), region, damping=self.config.damping)
+            region, damping = self.config.trust_region * left, self.config.damping
+            natural_step(parameters, self._divergence(rollout), region, damping=damping)
         elif self.config.optimiser == "episodic-natural":
             direction = self._regress_on_episodes(rollout, parameters)
-            step_along(direction, parameters, self._divergence(rollout), region)
+            step_along(direction, parameters, self._divergence(rollout), self.config.trust_region * left)
         else:
             self.optimiser.param_groups[0]["lr"] = self.config.learning_rate * left
             self.optimiser.step()
@@ -296,7 +282,6 @@ class PolicyGradient:
             "teacher": self.teacher.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "noise": self.policy.noise.state(),
-            "share": self.share,
             "last_return": self._last_return,
             "collection": self.collection.state_dict(),
         }
@@ -310,17 +295,13 @@ class PolicyGradient:
         self.optimiser.load_state_dict(state["optimiser"])
         self.collection.load_state_dict(state["collection"])
         self.policy.noise.restore(state["noise"])
-        self.share, self._last_return = state["share"], state["last_return"]
+        self._last_return = state["last_return"]
 
 
 def _gradient(parameters: list[torch.nn.Parameter]) -> Tensor:
     """The gradients as one vector for each learner [learners, P]; 0 where there is none yet."""
-    return _flat([torch.zeros_like(p) if p.grad is None else p.grad for p in parameters])
-
-
-def _flat(parts: Sequence[Tensor]) -> Tensor:
-    """A copy of the parts as one vector for each learner [learners, P]."""
-    return torch.cat([part.detach().flatten(1) for part in parts], 1).clone()
+    parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+    return torch.cat([part.flatten(1) for part in parts], 1).clone()
 
 
 def _controller(kind: str, observation_dim: int, action_dim: int, learners: range, seed: int) -> Controller:

@@ -2,7 +2,7 @@
 
 from torch_gprl.objectives.all_action import AllActionLoss
 from torch_gprl.objectives.episodic import compatible_weights, episode_scores, split_episodes
-from torch_gprl.objectives.natural import natural_step, step_along, trusted_share
+from torch_gprl.objectives.natural import natural_step, step_along
 from torch_gprl.objectives.policy_gradient import PolicyGradientLoss
 
 __all__ = [
@@ -13,5 +13,4 @@ __all__ = [
     "natural_step",
     "split_episodes",
     "step_along",
-    "trusted_share",
 ]

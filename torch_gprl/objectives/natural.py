@@ -12,13 +12,12 @@ from torch import Tensor, nn
 
 TOLERANCE = 4.0  # trust regions that a step may take in truth: its length comes from a quadratic form
 SHORTENINGS = 8  # tenfold, of a step that would take more; then it is not taken
-SHRINKAGE, GROWTH = 0.5, 2**0.5  # of the trust region, where a step went too far and where it did not
 
 
 def natural_step(
     parameters: Sequence[nn.Parameter],
     divergence: Callable[[], Float[Tensor, " learners"]],
-    max_divergence: float | Float[Tensor, " learners"],
+    max_divergence: float,
     iterations: int = 10,
     damping: float = 1e-3,
 ) -> Float[Tensor, " learners"]:
@@ -30,7 +29,7 @@ def natural_step(
         parameters: each [learners, ...], with gradients of a loss that is a sum over learners.
         divergence: mean KL(π_old ‖ π) of each learner [learners] as a function of the parameters; it is zero,
             with zero gradient, at their present values.
-        max_divergence: trust region, in nats; one for all learners, or each its own.
+        max_divergence: trust region, in nats.
         iterations: of conjugate gradients.
         damping: added to the Fisher matrix, relative to its mean diagonal along the gradient.
 
@@ -50,7 +49,7 @@ def step_along(
     direction: Float[Tensor, "learners P"],
     parameters: Sequence[nn.Parameter],
     divergence: Callable[[], Float[Tensor, " learners"]],
-    max_divergence: float | Float[Tensor, " learners"],
+    max_divergence: float,
 ) -> None:
     """Move `parameters` along a direction as far as `max_divergence`; see `natural_step` for the others.
 
@@ -63,25 +62,6 @@ def step_along(
     """
     fisher = _fisher_products(parameters, divergence)
     _move(parameters, direction, fisher, divergence, max_divergence)
-
-
-def trusted_share(
-    share: Float[Tensor, " learners"],
-    gradient: Float[Tensor, "learners P"],
-    last_step: Float[Tensor, "learners P"],
-) -> Float[Tensor, " learners"]:
-    """The share of the trust region that the next step of each learner may use.
-
-    A natural step is as long near an optimum as elsewhere, and leaps across it from side to side. It went too
-    far where the loss, asked behind it, rises along it (the curvature condition of Wolfe's line search).
-
-    Args:
-        share: that the last step used, from 0 to 1.
-        gradient: of the loss, behind the last step.
-        last_step: change of the parameters, flattened and in the gradient's order.
-    """
-    too_far = (gradient * last_step).sum(-1) > 0
-    return torch.where(too_far, SHRINKAGE * share, (GROWTH * share).clamp_max(1))
 
 
 def _fisher_products(
@@ -103,11 +83,10 @@ def _move(
     direction: Tensor,
     fisher: Callable[[Tensor], Tensor],
     divergence: Callable[[], Tensor],
-    max_divergence: float | Tensor,
+    max_divergence: float,
 ) -> None:
     quadratic = (direction * fisher(direction)).sum(-1, keepdim=True)
-    region = max_divergence * torch.ones_like(quadratic)[:, 0]
-    size = (2 * region.unsqueeze(-1) / quadratic.clamp_min(1e-30)).sqrt()
+    size = (2 * max_divergence / quadratic.clamp_min(1e-30)).sqrt()
     flat = quadratic <= 1e-30 * direction.square().sum(-1, keepdim=True)  # nothing to learn a length from
     step = torch.nan_to_num(torch.where(flat, 0.0, size * direction), nan=0.0, posinf=0.0, neginf=0.0)
     before = [parameter.clone() for parameter in parameters]
@@ -116,7 +95,7 @@ def _move(
     for _ in range(SHORTENINGS):
         for parameter, old, part in zip(parameters, before, _unflatten(step, parameters), strict=True):
             parameter.copy_(old + part)
-        near = divergence() <= TOLERANCE * region  # NaN is not
+        near = divergence() <= TOLERANCE * max_divergence  # NaN is not
         if near.all():
             return
         step = torch.where(near.unsqueeze(-1), step, 0.1 * step)

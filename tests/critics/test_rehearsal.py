@@ -81,3 +81,28 @@ def test_saturated_actions_come_back():
     rehearsed = rehearse(walks(steps=4), policy(), [torch.full_like(line(), 1.2)], ascents=60)
     ahead = torch.full((2, 1, 1), 0.5, dtype=torch.float64)
     assert (rehearsed(ahead) < -0.3).all()
+
+
+def test_learners_take_policies_of_one_or_the_other():
+    loc = torch.zeros(2, 1, 1, dtype=torch.float64)
+    few = SmoothPolicy(line(count=5), loc, loc + 0.9).learn(line(count=5))
+    many = policy().learn(-line())
+    mixed = few.where(torch.tensor([True, False]), many)
+    torch.testing.assert_close(mixed(line(count=9))[0], few(line(count=9))[0])
+    torch.testing.assert_close(mixed(line(count=9))[1], many(line(count=9))[1])
+
+
+def test_a_straight_policy_leads_on_beyond_its_states():
+    ahead = policy().learn(0.3 * line())(2 * line()[:, :1])  # where the bumps are over
+    assert ((ahead > -1) & (ahead < -0.4)).all()
+
+
+def test_walks_tell_where_they_are_halfway():
+    def count(states, actions):
+        end = (states >= 7).double().squeeze(-1)
+        return states + 1, states.squeeze(-1), end
+
+    start = torch.tensor([0.0, 6.0], dtype=torch.float64).reshape(1, 2, 1)
+    outcome = Walks(count, nothing, start, 6, DISCOUNT).walk(lambda states: states)
+    assert outcome.halfway.flatten().tolist() == [3.0, 6.0]  # the second is over by then
+    assert outcome.lasting.flatten().tolist() == [1.0, 0.0]

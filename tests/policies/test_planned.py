@@ -107,6 +107,21 @@ def test_the_temperature_falls_and_the_noise_too(planner):
     assert (wide.unique().item(), policy.std_at(states, action).unique().item()) == pytest.approx((0.5, 0.1))
 
 
+def test_who_has_settled_performs_and_others_explore():
+    env = envs.make("pendulum-swingup", learners=2, num_envs=1, seed=0)
+    learner = DynamicProgramming(env, dataclasses.replace(SMALL, rehearsal=2, ascents=0))
+    for _ in learner.train():
+        pass
+    state = learner.state_dict()
+    state["plan"]["performance"]["settled"] = torch.tensor([True, False]).view(2, 1, 1)
+    learner.load_state_dict(state)
+    states = states_of(torch.linspace(0.0, 6.0, 5))
+    actions = act(policy_of(learner, exploration="optimism", std=0.0), states)
+    performed, hopeful = (5 * learner.critic.best_action(states, explore) for explore in (False, True))
+    assert not torch.equal(performed, hopeful)
+    torch.testing.assert_close(actions, torch.stack([performed[0], hopeful[1]]))
+
+
 def test_a_learner_explores_alone_as_among_others():
     def actions(learners: int, first: int) -> torch.Tensor:
         env = envs.make("pendulum-swingup", learners=learners, num_envs=1, seed=0, first_learner=first)

@@ -15,7 +15,8 @@ from torch_gprl.critics.kernels_by_name import (
     suit_graphs,
 )
 from torch_gprl.critics.maximise import ActionMaximiser, Maximum
-from torch_gprl.critics.planned_value import PlannedValue, Planning
+from torch_gprl.critics.plan import Planning
+from torch_gprl.critics.planned_value import PlannedValue
 from torch_gprl.critics.returns import k_step_returns
 from torch_gprl.critics.transition_model import TransitionModel, Transitions
 from torch_gprl.critics.value_estimator import Critic, GPStateValue, GPValueEstimator

@@ -1,8 +1,28 @@
-"""What a plan is made of: support states and their values, what judges states, and where actions lead."""
+"""What a plan is made of: its numbers, support states and their values, and where actions lead."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Planning:
+    """The numbers of a plan."""
+
+    discount: float = 0.98  # γ per environment step
+    support: int = 200  # states whose values are planned, besides ends
+    imagined: int = 300  # imagined states that the support is chosen from, besides visited ones
+    sweeps: int = 40  # of value iteration, in each plan
+    backup_actions: int = 9  # actions compared in a sweep
+    lengthscale: float = 2.0  # of values, in the observations' standard deviations times √columns
+    novelty_lengthscale: float = 1.0  # in which a state counts as new, likewise
+    tremble: float = 0.25  # standard deviation of actions that is planned for, in halves of their range
+    optimism: float = 1.0  # hope for the best seen, and so many ranges of what steps pay more
+    hold: int = 2  # environment steps that an action is held for
+    smoothness: float = 0.5  # of values, as in Matérn kernels: 0.5, 1.5 or 2.5
+    rehearsal: int = 60  # steps of the imagined walks that improve what is performed; 0: perform the plan
+    ascents: int = 12  # gradient steps of a rehearsal
 
 
 class Support(NamedTuple):

@@ -26,18 +26,18 @@ A second value, for exploration, takes what the model does not know for better t
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torch_gprl.critics.ends import Ends
 from torch_gprl.critics.maximise import candidate_actions
-from torch_gprl.critics.plan import Course, Support
-from torch_gprl.critics.rehearsal import SmoothPolicy, Walks, rehearse, spread
-from torch_gprl.critics.transition_model import Prediction, TransitionModel, Transitions
+from torch_gprl.critics.performance import Imagination, Performance, prepare
+from torch_gprl.critics.plan import Course, Planning, Support
+from torch_gprl.critics.rehearsal import SmoothPolicy, Walks, spread
+from torch_gprl.critics.transition_model import MARGIN, Prediction, TransitionModel, Transitions
 from torch_gprl.gp import Posterior
 from torch_gprl.graphs import farthest_points
 from torch_gprl.kernels import Kernel, Matern, SquaredExponential
@@ -47,28 +47,9 @@ EXPLOIT, EXPLORE = 0, 1  # columns of the values
 VALUE_NOISE, NOVELTY_NOISE = 1e-3, 1e-2  # of regressions under kernels of variance 1
 IMAGINED_STEPS = 2  # from a known state to an imagined one
 FIRST_SWEEPS = 3  # times as many as later: those begin from the last value
-WALKS, TRIALS = 24, 8  # imagined walks, from states of the experience on: to rehearse, and to compare
-CLEARLY = 0.01  # share of the range of values by which what is rehearsed must earn more than the plan
+FAR = 1.0  # ranges of what was seen by which walks may leave it: its edge is no wall to lean on
+NOTHING = 0.01  # share of the range of values that is not worth exploring for
 CHUNK = 2**22  # numbers of the largest temporary: bounds the memory
-
-
-@dataclass(frozen=True)
-class Planning:
-    """The numbers of a plan."""
-
-    discount: float = 0.98  # γ per environment step
-    support: int = 200  # states whose values are planned, besides ends
-    imagined: int = 300  # imagined states that the support is chosen from, besides visited ones
-    sweeps: int = 40  # of value iteration, in each plan
-    backup_actions: int = 9  # actions compared in a sweep
-    lengthscale: float = 2.0  # of values, in the observations' standard deviations times √columns
-    novelty_lengthscale: float = 1.0  # in which a state counts as new, likewise
-    tremble: float = 0.25  # standard deviation of actions that is planned for, in halves of their range
-    optimism: float = 1.0  # the unknown is hoped to hold the best seen, and so many attainable ranges more
-    hold: int = 2  # environment steps that an action is held for
-    smoothness: float = 0.5  # of values, as in Matérn kernels: 0.5, 1.5 or 2.5
-    rehearsal: int = 60  # steps of the imagined walks that improve what is performed; 0: perform the plan
-    ascents: int = 10  # gradient steps of a rehearsal
 
 
 class PlannedValue:
@@ -93,8 +74,7 @@ class PlannedValue:
         self._backup_actions = self._candidates(low, high, planning.backup_actions)
         self.acting_actions = self._candidates(low, high, acting_actions)
         self._support: Support | None = None  # of the plan
-        self._rehearsed: SmoothPolicy | None = None
-        self._performed: Tensor | None = None  # [L, 1, 1] whether it is what is performed
+        self._performance: Performance | None = None
 
     def _candidates(self, low: Tensor, high: Tensor, count: int) -> Tensor:
         return (candidate_actions(low, high, count) - self._centre) / self._half
@@ -103,6 +83,11 @@ class PlannedValue:
     def planned(self) -> bool:
         """Whether there is a plan."""
         return self._support is not None
+
+    @property
+    def settled(self) -> Bool[Tensor, "L 1 1"] | None:
+        """Whether learners have nothing left to explore for; None where nothing is rehearsed."""
+        return None if self._performance is None else self._performance.settled
 
     # ---------------------------------------------------------------- planning
 
@@ -135,34 +120,36 @@ class PlannedValue:
             self._rehearse(data.observation)
 
     def _rehearse(self, visited: Float[Tensor, "L N S"]) -> None:
-        """Improve the smooth policy by the model, and compare it with the plan's best actions."""
-        support, last = self._support, self._rehearsed
+        """Improve a smooth policy by the model, and choose what is performed."""
+        support, planning = self._support, self.planning
         assert support is not None
-        pool = torch.cat([support.observation, spread(visited, self.planning.support)], 1)
-        chosen = farthest_points(self._scaled(pool), self.planning.support).chosen
-        states = pool.take_along_dim(chosen.unsqueeze(-1), 1)
-        greedy = self._greedy_action(states, explore=False)
-        choices = [greedy] if last is None else [last(states), greedy]
-        policy = SmoothPolicy(states, support.loc, support.scale)
-        walks = self._walks(spread(visited, WALKS))
-        self._rehearsed = policy = rehearse(walks, policy, choices, self.planning.ascents)
-        trials = self._walks(spread(visited, TRIALS))
-        gain = trials.earned(policy) - trials.earned(lambda state: self._greedy_action(state, explore=False))
-        self._performed = (gain > CLEARLY * (self._high - self._low).squeeze(-1)).view(-1, 1, 1)
+        pool = torch.cat([support.observation, spread(visited, planning.support)], 1)
+        chosen = farthest_points(self._scaled(pool), planning.support).chosen
+        policy = SmoothPolicy(pool.take_along_dim(chosen.unsqueeze(-1), 1), support.loc, support.scale)
+        imagination = Imagination(
+            self._walks,
+            lambda states: self._best_of(self.acting_actions, states, explore=False),
+            lambda states: self._best_of(self._backup_actions, states, explore=False),
+            lambda states: self.candidate_values(states, explore=True).amax(-1),
+            visited,
+            NOTHING * (self._high - self._low).squeeze(-1),
+        )
+        steps, ascents = planning.rehearsal, planning.ascents
+        self._performance = prepare(imagination, policy, self._performance, steps, ascents)
 
-    def _walks(self, start: Float[Tensor, "L N S"]) -> Walks:
+    def _walks(self, start: Float[Tensor, "L N S"], steps: int) -> Walks:
         """Imagined walks by the model, with the plan's value of where they get to."""
         support = self._support
         assert support is not None
 
         def step(states: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            step, end = self._step(states, actions, doubt=False)
+            step, end = self._step(states, actions, doubt=False, margin=FAR)
             return step.observation, step.reward, end
 
         def value(states: Tensor) -> Tensor:
             return self._values_of(support, states)[..., EXPLOIT]
 
-        return Walks(step, value, start, self.planning.rehearsal, self.planning.discount)
+        return Walks(step, value, start, steps, self.planning.discount)
 
     def _kernels(self, like: Tensor) -> tuple[Kernel, Kernel]:
         """Of values and of novelty, in scaled coordinates, where the length scale of values is 1."""
@@ -216,7 +203,9 @@ class PlannedValue:
         values = torch.cat([for_ever, once, nothing], 1)
         self._low = values.nan_to_num(torch.inf).amin(1, keepdim=True)
         self._high = values.nan_to_num(-torch.inf).amax(1, keepdim=True)
-        extent = torch.where(self._high > self._low, self._high - self._low, 1.0)  # 1: nothing was paid yet
+        # an end pays once: the hope for more than was seen is for steps that pay more
+        most, least = for_ever.nan_to_num(-torch.inf).amax(1), for_ever.nan_to_num(torch.inf).amin(1)
+        extent = torch.where(self._high > self._low, (most - least).unsqueeze(1), 1.0)  # 1: all is alike yet
         self._hope = self._high + self.planning.optimism * extent
 
     def _iterate(self, values: Tensor, sweeps: int) -> None:
@@ -257,9 +246,11 @@ class PlannedValue:
             lasting = lasting * (1 - end)
         return Course(observation, reward, lasting, unsure)
 
-    def _step(self, observation: Tensor, action: Tensor, doubt: bool) -> tuple[Prediction, Tensor]:
+    def _step(
+        self, observation: Tensor, action: Tensor, doubt: bool, margin: float = MARGIN
+    ) -> tuple[Prediction, Tensor]:
         """What a step leads to, with what an end pays; and how far that looks like an end [L, N], 0 to 1."""
-        step = self.model.predict(observation, action, doubt)
+        step = self.model.predict(observation, action, doubt, margin)
         end, prize = self._ends.judge(self._scaled(step.observation))
         return step._replace(reward=step.reward + prize), end
 
@@ -309,20 +300,28 @@ class PlannedValue:
         return torch.lerp(value, self._hope.expand_as(value), self._unknown(course)[..., EXPLORE])
 
     def best_action(self, observation: Float[Tensor, "L N S"], explore: bool) -> Float[Tensor, "L N A"]:
-        """What to do, in halves of the actuator's range: the best candidate, or what is rehearsed."""
-        best = self._greedy_action(observation, explore)
-        rehearsed, better = self._rehearsed, self._performed
-        if explore or rehearsed is None or better is None:
-            return best
-        return torch.where(better, rehearsed(observation), best)
+        """What to do, in halves of the actuator's range: to explore, or what is performed."""
 
-    def _greedy_action(self, observation: Tensor, explore: bool) -> Float[Tensor, "L N A"]:
-        return self.acting_actions[self.candidate_values(observation, explore).argmax(-1)]
+        def planned(states: Tensor) -> Tensor:
+            return self._best_of(self.acting_actions, states, explore)
+
+        if explore or self._performance is None:
+            return planned(observation)
+        return self._performance.action(observation, planned)
+
+    def _best_of(
+        self, actions: Float[Tensor, "J A"], states: Tensor, explore: bool
+    ) -> Float[Tensor, "L N A"]:
+        return actions[self._values_of_actions(states, actions, explore).argmax(-1)]
 
     @torch.no_grad()
     def candidate_values(self, observation: Float[Tensor, "L N S"], explore: bool) -> Float[Tensor, "L N J"]:
-        """The values of all candidate actions, each averaged over actions near it."""
-        actions = self.acting_actions
+        """The values of all actions compared when acting [J], each averaged over actions near it."""
+        return self._values_of_actions(observation, self.acting_actions, explore)
+
+    def _values_of_actions(
+        self, observation: Tensor, actions: Float[Tensor, "J A"], explore: bool
+    ) -> Float[Tensor, "L N J"]:
         trembling = self._trembling(actions)
         each = len(observation) * len(actions) * (self.model.budget + self.planning.support)
         values = []
@@ -380,8 +379,8 @@ class PlannedValue:
         if self._support is None:
             return {}
         state: dict[str, Any] = {"support": self._support._asdict()}
-        if self._rehearsed is not None:
-            state |= {"rehearsed": self._rehearsed.state_dict(), "performed": self._performed}
+        if self._performance is not None:
+            state["performance"] = self._performance.state_dict()
         return state
 
     def load_state_dict(self, state: dict[str, Any], data: Transitions) -> None:
@@ -390,6 +389,5 @@ class PlannedValue:
             self._judge(data, self._kernels(data.observation))
             self._bound(data)
             self._support = Support(**state["support"])
-        if "rehearsed" in state:
-            self._rehearsed = SmoothPolicy.restored(state["rehearsed"])
-            self._performed = state["performed"]
+        if "performance" in state:
+            self._performance = Performance.restored(state["performance"])

@@ -168,8 +168,7 @@ class TransitionModel:
         """Learn all experience anew, with new hyper-parameters if asked."""
         seen = torch.cat([data.observation, data.following], 1)
         self.loc, self.scale = moments(data.observation)
-        low, high = seen.amin(1, keepdim=True), seen.amax(1, keepdim=True)
-        self._low, self._high = low - MARGIN * (high - low), high + MARGIN * (high - low)
+        self._low, self._high = seen.amin(1, keepdim=True), seen.amax(1, keepdim=True)
         inputs = self.inputs(data.observation, data.action)
         self.motion.solve(inputs, data.following - data.observation, fit)
         ended = data.terminated > 0.5
@@ -184,16 +183,21 @@ class TransitionModel:
         """Standardised observations beside actions."""
         return torch.cat([(observation - self.loc) / self.scale, action], -1)
 
-    def predict(self, observation: Tensor, action: Tensor, doubt: bool = True) -> Prediction:
-        """What steps lead to, within the range of what was seen; differentiable in both, but for the doubt.
+    def predict(
+        self, observation: Tensor, action: Tensor, doubt: bool = True, margin: float = MARGIN
+    ) -> Prediction:
+        """What steps lead to, near what was seen; differentiable in both, but for the doubt.
 
         Args:
             observation: [L, N, S].
             action: [L, N, A], in halves of the actuator's range.
             doubt: whether doubt about the motion is computed, at several times the cost; else it is zero.
+            margin: share by which predictions may leave the range of what was seen, on either side.
         """
         inputs = self.inputs(observation, action)
-        following = torch.clamp(observation + self.motion.mean(inputs), self._low, self._high)
+        beyond = margin * (self._high - self._low)
+        following = observation + self.motion.mean(inputs)
+        following = torch.clamp(following, self._low - beyond, self._high + beyond)
         reward = torch.clamp(self.reward.mean(inputs).squeeze(-1), self._reward_low, self._reward_high)
         unsure = self.motion.doubt(inputs) if doubt else torch.zeros_like(reward)
         return Prediction(following, reward, unsure)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields
 
-from torch_gprl.critics.planned_value import Planning
+from torch_gprl.critics.plan import Planning
 from torch_gprl.learners.ranges import check_ranges
 from torch_gprl.policies import PlannedBehaviour
 
@@ -32,7 +32,7 @@ class DynamicProgrammingConfig(PlannedBehaviour):
     total_frames: int = 2_000  # environment steps per learner, over all its environments
     rollout_steps: int = 25  # steps of each environment between two looks at the plan
     first_steps: int = 50  # environment steps per learner of random actions, before the first plan
-    growth: float = 0.05  # share by which experience grows between plans
+    growth: float = 0.1  # share by which experience grows between plans
     discount: float = 0.98  # γ per environment step, from 0 to 1, 1 excluded
 
     model_budget: int = 200  # basis vectors of the model of the steps
@@ -47,9 +47,9 @@ class DynamicProgrammingConfig(PlannedBehaviour):
     hold: int = 2  # environment steps that a plan holds an action for; acting chooses anew at every step
     smoothness: float = 0.5  # of values, as in Matérn kernels: 0.5, 1.5 or 2.5
     rehearsal: int = 60  # steps of the imagined walks that improve what is performed; 0: perform the plan
-    ascents: int = 10  # gradient steps of a rehearsal
+    ascents: int = 12  # gradient steps of a rehearsal
 
-    optimism: float = 1.0  # exploring hopes for the best seen and so many ranges of value more
+    optimism: float = 1.0  # exploring hopes for the best seen, and so many ranges of what steps pay more
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range.

@@ -135,7 +135,7 @@ class PlannedPolicy(TensorDictModuleBase):
         return self._last
 
     def _strayed(self, states: Tensor, like: Tensor) -> Float[Tensor, "L N A"]:
-        """The scheme's action and its noise."""
+        """The scheme's action, or what is performed where there is nothing to explore for, and noise."""
         scheme = self.behaviour.exploration
         if scheme == "gibbs":
             draw = self.noise.draw(torch.cat([like, like[..., :1]], -1))
@@ -143,6 +143,8 @@ class PlannedPolicy(TensorDictModuleBase):
         else:
             noise = self.noise.draw(like)
             action = self._value.best_action(states, explore=scheme != "gaussian")
+        if self._value.settled is not None:
+            action = torch.where(self._value.settled, self._value.best_action(states, explore=False), action)
         return torch.clamp(action + self.std_at(states, action) * noise, -1, 1)
 
     def std_at(self, states: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"]) -> Tensor:

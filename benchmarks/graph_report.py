@@ -102,18 +102,21 @@ def write_summary(scores: list[Score], folder: Path) -> None:
 def _spreads(by_kernel: dict[str, list[Score]], folder: Path) -> dict[str, dict[str, object]]:
     """Squared bias and variance of each kernel, the latter also in parts of the best Euclidean kernel's.
 
-    That is the one of the least mean RMSE: a prior that hardly learns has no variance. With its interval,
-    where both have learned from the same seeds, of which there must be two.
+    That is the one of the least mean RMSE: a prior that hardly learns has no variance. With its interval, on
+    the seeds that both have learned from. There must be two seeds.
     """
-    inner = {name: _inner_products(runs, folder) for name, runs in by_kernel.items() if len(runs) > 1}
-    rivals = [name for name in inner if name in EUCLIDEAN]
-    best = min(rivals, key=lambda name: _mean(by_kernel[name], "rmse"), default=None)
+    rivals = [name for name in by_kernel if name in EUCLIDEAN]
+    best = by_kernel[min(rivals, key=lambda name: _mean(by_kernel[name], "rmse"))] if rivals else []
     found: dict[str, dict[str, object]] = {}
-    for name, products in inner.items():
-        bias, variance = split(products)
+    for name, runs in by_kernel.items():
+        if len(runs) < 2:
+            continue
+        bias, variance = split(_inner_products(runs, folder))
         found[name] = {"squared_bias": round(bias, DIGITS + 1), "variance": round(variance, DIGITS + 1)}
-        if best and [s.seed for s in by_kernel[name]] == [s.seed for s in by_kernel[best]]:
-            ratio = variance_ratio(products, inner[best])
+        shared = {s.seed for s in runs} & {s.seed for s in best}
+        if len(shared) > 1:
+            pair = ([s for s in part if s.seed in shared] for part in (runs, best))
+            ratio = variance_ratio(*(_inner_products(part, folder) for part in pair))
             found[name]["variance_in_parts"] = [round(number, 2) for number in ratio]
     return found
 

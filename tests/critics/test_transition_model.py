@@ -34,3 +34,14 @@ def test_who_has_not_seen_the_wall_at_first_learns_it_as_well_as_others():
     for model in (before, fresh):
         model.solve(towards_a_wall(160, 1.1, seed=20), fit=True)
     assert error(before) < 1.1 * error(fresh)
+
+
+def test_predictions_leave_the_range_of_what_was_seen_no_farther_than_told():
+    model, data = TransitionModel(1, 2, 1, budget=50), towards_a_wall(60, 0.7, seed=1)
+    model.solve(data, fit=False)
+    top = torch.cat([data.observation, data.following], 1)[..., 1].max()
+    edge = torch.stack([torch.tensor(0.3).double(), top]).view(1, 1, 2)
+    up = torch.ones(1, 1, 1, dtype=torch.float64)
+    stopped, free = (model.predict(edge, up, margin=margin).observation[..., 1] for margin in (0.0, 1.0))
+    assert stopped.item() == top.item()
+    torch.testing.assert_close(free, edge[..., 1] + 0.1, rtol=0, atol=0.03)

@@ -142,12 +142,13 @@ class Teacher:
         """
         assert self.experience is not None
         count, every = self.config.solved, self.experience.all()
-        if every.shape[1] <= count:
+        learners, steps = every.batch_size
+        if steps <= count:
             return
-        rows = torch.arange(every.shape[1], device=new.device) if self.solved is None else new
-        rows = rows.expand(every.shape[0], -1)
-        if self.solved is not None:
-            rows = torch.cat([self.solved, rows], 1)
+        if self.solved is None:
+            rows = torch.arange(steps, device=every.get("action").device).expand(learners, -1)
+        else:
+            rows = torch.cat([self.solved, new.to(self.solved.device).expand(learners, -1)], 1)
         some = every.gather(1, rows)
         inputs = self.critic.inputs(some.get("observation"), some.get("action"))
         spread = inputs.std(-2, keepdim=True)

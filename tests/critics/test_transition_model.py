@@ -45,3 +45,15 @@ def test_predictions_leave_the_range_of_what_was_seen_no_farther_than_told():
     stopped, free = (model.predict(edge, up, margin=margin).observation[..., 1] for margin in (0.0, 1.0))
     assert stopped.item() == top.item()
     torch.testing.assert_close(free, edge[..., 1] + 0.1, rtol=0, atol=0.03)
+
+def test_a_reward_that_was_met_a_few_times_is_remembered():
+    """A narrow reward, three times in 500 steps through a wide square."""
+    generator = torch.Generator().manual_seed(2)
+    state = 4 * torch.rand(2, 500, 2, generator=generator, dtype=torch.float64) - 2
+    action = 2 * torch.rand(2, 500, 1, generator=generator, dtype=torch.float64) - 1
+    state[:, 100:400:100] = 0.1 * state[:, 100:400:100]
+    reward = torch.exp(-state.square().sum(-1) / (2 * 0.15**2))
+    model = TransitionModel(2, 2, 1, budget=100)
+    model.solve(Transitions(state, action, reward, state, torch.zeros_like(reward)), fit=True)
+    met = model.predict(state, action, doubt=False).reward[:, 100:400:100]
+    torch.testing.assert_close(met, reward[:, 100:400:100], rtol=0, atol=0.4)

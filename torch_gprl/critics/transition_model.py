@@ -10,7 +10,7 @@ import math
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.distributions import LogNormal
 
@@ -63,11 +63,13 @@ class Regressor:
         learners: L, how many.
         columns: D, of the inputs.
         budget: basis vectors.
+        sharp: whether targets may change much between near inputs. Data to fit to, and basis vectors, then
+            lie apart in targets as well, or a reward that was met a few times would be smoothed away.
     """
 
-    def __init__(self, learners: int, columns: int, budget: int) -> None:
+    def __init__(self, learners: int, columns: int, budget: int, sharp: bool = False) -> None:
         batch = (learners,)
-        self.budget = budget
+        self.budget, self.sharp = budget, sharp
         self.bends = SquaredExponential(columns, 2.0, batch_shape=batch)
         self.bends.set_prior("lengthscale", LogNormal(math.log(2.0), 1.0))
         self.bends.set_prior("outputscale", LogNormal(0.0, 2.0))
@@ -83,12 +85,25 @@ class Regressor:
         self._target_loc, self._target_scale = moments(targets)
         targets = (targets - self._target_loc) / self._target_scale
         if fit:
-            spaced = torch.linspace(0, inputs.shape[1] - 1, min(FIT_POINTS, inputs.shape[1])).long()
-            self._fit(inputs[:, spaced], targets[:, spaced])
-        lengths = self.bends.lengthscale.detach().unsqueeze(-2)
-        chosen = farthest_points(inputs / lengths, self.budget).chosen
-        basis = inputs.take_along_dim(chosen.unsqueeze(-1), 1)
+            some = self._spread(inputs, targets)
+            self._fit(inputs.take_along_dim(some, 1), targets.take_along_dim(some, 1))
+        basis = inputs.take_along_dim(self._apart(inputs, targets, self.budget), 1)
         self._regression = SparseRegression(self.kernel, basis, inputs, targets, self.log_noise.exp())
+
+    def _spread(self, inputs: Tensor, targets: Tensor) -> Int[Tensor, "L M 1"]:
+        """Data to fit hyper-parameters to."""
+        if self.sharp:
+            return self._apart(inputs, targets, FIT_POINTS)
+        steps = inputs.shape[1]
+        spaced = torch.linspace(0, steps - 1, min(FIT_POINTS, steps), device=inputs.device)
+        return spaced.long().view(1, -1, 1).expand(len(inputs), -1, -1)
+
+    def _apart(self, inputs: Tensor, targets: Tensor, count: int) -> Int[Tensor, "L M 1"]:
+        """Data that lie apart."""
+        places = inputs / self.bends.lengthscale.detach().unsqueeze(-2)
+        if self.sharp:
+            places = torch.cat([places, targets], -1)
+        return farthest_points(places, count).chosen.unsqueeze(-1)
 
     def mean(self, inputs: Float[Tensor, "L N D"]) -> Float[Tensor, "L N T"]:
         """Expected targets."""
@@ -162,7 +177,7 @@ class TransitionModel:
     def __init__(self, learners: int, states: int, actions: int, budget: int) -> None:
         self.budget = budget
         self.motion = Regressor(learners, states + actions, budget)
-        self.reward = Regressor(learners, states + actions, budget)
+        self.reward = Regressor(learners, states + actions, budget, sharp=True)
 
     def solve(self, data: Transitions, fit: bool) -> None:
         """Learn all experience anew, with new hyper-parameters if asked."""

@@ -1,5 +1,6 @@
 """Exploring on a plan: each way strays from the plan's best action as it says, and learners stay apart."""
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -10,6 +11,8 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import envs
+from torch_gprl.critics import PlannedValue
+from torch_gprl.critics.look_ahead import continued
 from torch_gprl.learners import DynamicProgramming, DynamicProgrammingConfig
 from torch_gprl.policies import PlannedBehaviour, PlannedPolicy
 
@@ -23,6 +26,8 @@ SMALL = DynamicProgrammingConfig(
     acting_actions=9,
     novelty_lengthscale=0.5,
     rehearsal=0,
+    look_ahead=0,
+    variations=8,
 )
 LOW, HIGH = torch.tensor([-5.0], dtype=torch.float64), torch.tensor([5.0], dtype=torch.float64)
 
@@ -53,6 +58,43 @@ def test_without_noise_each_way_takes_the_best_action_of_its_plan(planner):
     for scheme, hopeful in (("optimism", True), ("gaussian", False)):
         best = 5 * planner.critic.best_action(states, explore=hopeful)
         torch.testing.assert_close(act(policy_of(planner, exploration=scheme, std=0.0), states), best)
+
+
+def ahead_of(planner: DynamicProgramming, steps: int) -> PlannedValue:
+    """The planner's plan, with a look ahead of so many steps."""
+    value = copy.copy(planner.critic)
+    value.planning = dataclasses.replace(value.planning, look_ahead=steps)
+    return value
+
+
+def test_looking_ahead_takes_the_first_action_of_a_course_and_goes_on_with_the_rest(planner):
+    value, states = ahead_of(planner, 6), states_of(torch.linspace(2.0, 4.0, 7))
+    policy = PlannedPolicy(value, LOW, HIGH, PlannedBehaviour(), 0, (0, 1))
+    course = value.course(states)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        seen = policy(TensorDict({"observation": states}, states.shape[:2]))
+        torch.testing.assert_close(seen["action"], 5 * course[:, :, 0])
+        torch.testing.assert_close(seen["course"], continued(course))
+        again = policy(TensorDict({"observation": states, "course": seen["course"]}, states.shape[:2]))
+    torch.testing.assert_close(again["action"], 5 * value.course(states, continued(course))[:, :, 0])
+
+
+def test_environments_hand_the_course_on_to_the_next_step(planner):
+    policy = PlannedPolicy(ahead_of(planner, 4), LOW, HIGH, PlannedBehaviour(), 0, (0, 1))
+    env = envs.make("pendulum-swingup", learners=2, num_envs=1, seed=0)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        seen = policy(env.reset())
+        course = seen["course"].clone()
+        _, state = env.step_and_maybe_reset(seen)
+    assert torch.equal(state["course"], course)
+
+
+def test_when_exploring_nobody_looks_ahead(planner):
+    value, states = ahead_of(planner, 6), states_of(torch.linspace(2.0, 4.0, 7))
+    policy = PlannedPolicy(value, LOW, HIGH, PlannedBehaviour(std=0.0), 0, (0, 1))
+    seen = policy(TensorDict({"observation": states}, states.shape[:2]))
+    assert "course" not in seen
+    torch.testing.assert_close(seen["action"], 5 * value.best_action(states, explore=True))
 
 
 def test_when_exploiting_all_ways_are_one(planner):

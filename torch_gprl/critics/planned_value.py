@@ -17,15 +17,14 @@ that were met, whose value is zero: what an end pays belongs to the step that le
 The maximum is taken over averages of nearby actions, as if the hand trembled. Where many actions serve
 equally well, up to an edge beyond which none does, this keeps away from the edge.
 
-What is performed when nothing is explored is a smooth policy, rehearsed in imagination (`rehearsal`), where
-it earns clearly more there than the plan's best actions. These err where many are worth nearly the same, and
-are others after every plan; but they switch more sharply.
+What is performed when nothing is explored: see `performance`; who has not settled looks ahead (`look_ahead`).
 
 A second value, for exploration, takes what the model does not know for better than all that was seen
 (optimism in the face of uncertainty): a share of each backup, as large as the doubt, is the highest hope.
 """
 
 import math
+from functools import partial
 from typing import Any
 
 import torch
@@ -33,9 +32,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torch_gprl.critics.ends import Ends
+from torch_gprl.critics.look_ahead import LookAhead, variations
 from torch_gprl.critics.maximise import candidate_actions
 from torch_gprl.critics.performance import Imagination, Performance, prepare
-from torch_gprl.critics.plan import Course, Planning, Support
+from torch_gprl.critics.plan import Course, Planning, Support, attainable, trembling_weights
 from torch_gprl.critics.rehearsal import SmoothPolicy, Walks, spread
 from torch_gprl.critics.transition_model import MARGIN, Prediction, TransitionModel, Transitions
 from torch_gprl.gp import Posterior
@@ -105,7 +105,7 @@ class PlannedValue:
         self._judge(data, kernels)
         observation = self._choose(data, uniform)
         scaled = torch.cat([self._scaled(observation), self._ends.scaled], 1)
-        self._bound(data)
+        self._low, self._high, self._hope = attainable(data, self.planning)
         average = (self._low + self._high) / 2
         values = average.unsqueeze(-1).expand(*observation.shape[:2], 2)
         if before is not None:
@@ -194,20 +194,6 @@ class PlannedValue:
         chosen = farthest_points(self._scaled(pool), self.planning.support).chosen
         return pool.take_along_dim(chosen.unsqueeze(-1), 1)
 
-    def _bound(self, data: Transitions) -> None:
-        """The attainable range of values [L, 1]."""
-        ended, horizon = data.terminated > 0.5, 1 - self.planning.discount
-        # V is a mean of what is paid for ever and of what an end pays once
-        for_ever = torch.where(ended, torch.nan, data.reward / horizon)
-        once, nothing = (torch.where(ended, paid, torch.nan) for paid in (data.reward, 0.0))
-        values = torch.cat([for_ever, once, nothing], 1)
-        self._low = values.nan_to_num(torch.inf).amin(1, keepdim=True)
-        self._high = values.nan_to_num(-torch.inf).amax(1, keepdim=True)
-        # an end pays once: the hope for more than was seen is for steps that pay more
-        most, least = for_ever.nan_to_num(-torch.inf).amax(1), for_ever.nan_to_num(torch.inf).amin(1)
-        extent = torch.where(self._high > self._low, (most - least).unsqueeze(1), 1.0)  # 1: all is alike yet
-        self._hope = self._high + self.planning.optimism * extent
-
     def _iterate(self, values: Tensor, sweeps: int) -> None:
         """Value iteration at the support."""
         support, actions = self._support, self._backup_actions
@@ -220,7 +206,7 @@ class PlannedValue:
         eye = torch.eye(support.scaled.shape[1], dtype=cross.dtype, device=cross.device)
         factor = cholesky(self._kernel(support.scaled, support.scaled) + VALUE_NOISE * eye)
         lowest, highest = self._range()
-        trembling = self._trembling(actions)
+        trembling = trembling_weights(actions, self.planning.tremble)
         for _ in range(sweeps):
             weights = torch.cholesky_solve(self._residual(values), factor)
             beyond = torch.clamp(cross @ weights + support.prior, lowest, highest)
@@ -253,11 +239,6 @@ class PlannedValue:
         step = self.model.predict(observation, action, doubt, margin)
         end, prize = self._ends.judge(self._scaled(step.observation))
         return step._replace(reward=step.reward + prize), end
-
-    def _trembling(self, actions: Float[Tensor, "J A"]) -> Float[Tensor, "J J"]:
-        """Weights by which the value of an action is averaged over actions near it."""
-        away = torch.cdist(actions, actions, compute_mode="donot_use_mm_for_euclid_dist")
-        return torch.softmax(-0.5 * (away / self.planning.tremble).square(), -1)
 
     def _residual(self, values: Tensor) -> Tensor:
         """Values at the support less their prior mean; at ends the value is zero."""
@@ -309,6 +290,33 @@ class PlannedValue:
             return planned(observation)
         return self._performance.action(observation, planned)
 
+    @torch.no_grad()
+    def course(
+        self, observation: Float[Tensor, "L N S"], last: Float[Tensor, "L N H A"] | None = None
+    ) -> Float[Tensor, "L N H A"]:
+        """What to do now and in the next steps, in halves of the actuator's range (`look_ahead`).
+
+        Args:
+            observation: the states.
+            last: a course to go on with; that of what is performed unless told.
+        """
+        planning, walks = self.planning, self._walks(observation, self.planning.look_ahead)
+        ahead = LookAhead(walks.step, walks.value, self._roughly_performed, planning.discount, walks.steps)
+        varied = variations(planning.variations, walks.steps, len(self._half))
+        each = len(observation) * (len(varied) + 2) * (self.model.budget + planning.support)
+        return ahead.course(observation, last, varied, max(1, CHUNK // each))
+
+    def _roughly_performed(self, states: Tensor) -> Float[Tensor, "L N A"]:
+        """What is performed without looking ahead, out of fewer actions."""
+        planned = partial(self._best_of, self._backup_actions, explore=False)
+        return planned(states) if self._performance is None else self._performance.action(states, planned)
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether anybody looks ahead before acting: not who has settled on what is performed."""
+        settled = self._performance is not None and self._performance.all_settled
+        return self.planned and self.planning.look_ahead > 0 and not settled
+
     def _best_of(
         self, actions: Float[Tensor, "J A"], states: Tensor, explore: bool
     ) -> Float[Tensor, "L N A"]:
@@ -322,7 +330,7 @@ class PlannedValue:
     def _values_of_actions(
         self, observation: Tensor, actions: Float[Tensor, "J A"], explore: bool
     ) -> Float[Tensor, "L N J"]:
-        trembling = self._trembling(actions)
+        trembling = trembling_weights(actions, self.planning.tremble)
         each = len(observation) * len(actions) * (self.model.budget + self.planning.support)
         values = []
         for some in observation.split(max(1, CHUNK // each), 1):
@@ -336,12 +344,7 @@ class PlannedValue:
     def reward(
         self, observation: Float[Tensor, "L N S"], action: Float[Tensor, "L N A"]
     ) -> Float[Tensor, "L N"]:
-        """The reward that is expected of one step, with what an end pays.
-
-        Args:
-            observation: the states.
-            action: in halves of the actuator's range.
-        """
+        """The reward expected of one step, with what an end pays; actions in halves of their range."""
         return self._step(observation, action, doubt=False)[0].reward
 
     @torch.no_grad()
@@ -387,7 +390,7 @@ class PlannedValue:
         """Take up what `state_dict` gave, with the experience that was planned on."""
         if state:
             self._judge(data, self._kernels(data.observation))
-            self._bound(data)
+            self._low, self._high, self._hope = attainable(data, self.planning)
             self._support = Support(**state["support"])
         if "performance" in state:
             self._performance = Performance.restored(state["performance"])

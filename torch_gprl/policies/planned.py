@@ -25,6 +25,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torch_gprl.critics.look_ahead import continued
 from torch_gprl.critics.planned_value import PlannedValue
 from torch_gprl.policies.confidence_noise import ConfidenceScale
 from torch_gprl.policies.gaussian import explores
@@ -81,7 +82,8 @@ class PlannedPolicy(TensorDictModuleBase):
     """Acts on a plan as a `PlannedBehaviour` says; smooth random actions as long as there is none.
 
     Reads `observation` [L, envs, S], writes `action`. Under TorchRL's `ExplorationType.DETERMINISTIC` it acts
-    on the plan that does not count on the unknown, without noise.
+    on the plan that does not count on the unknown, without noise. Who has not settled looks ahead: `course`
+    [L, envs, H, A], also written, is what it would do next, and goes on where the next tensordict has it.
 
     Args:
         value: the plan.
@@ -120,8 +122,22 @@ class PlannedPolicy(TensorDictModuleBase):
         """Write the action."""
         observation = tensordict.get("observation")
         states = observation.to(self._half.dtype).reshape(len(observation), -1, observation.shape[-1])
-        share = self._share(states).reshape(*observation.shape[:-1], -1)
+        looks = self._value.looks_ahead and not explores()
+        share = self._ahead(states, tensordict) if looks else self._share(states)
+        share = share.reshape(*observation.shape[:-1], -1)
         return tensordict.set("action", (self._centre + share * self._half).to(observation.dtype))
+
+    def _ahead(self, states: Tensor, tensordict: TensorDictBase) -> Float[Tensor, "L N A"]:
+        """First actions of courses, for learners that have not settled; the rest goes to the tensordict."""
+        last = tensordict.get("course", None)
+        last = None if last is None else last.to(states).reshape(*states.shape[:2], *last.shape[-2:])
+        course = self._value.course(states, last)
+        rest = continued(course)
+        tensordict.set("course", rest.reshape(*tensordict.batch_size, *rest.shape[-2:]))
+        settled = self._value.settled
+        if settled is None:
+            return course[:, :, 0]
+        return torch.where(settled, self._value.best_action(states, explore=False), course[:, :, 0])
 
     def _share(self, states: Tensor) -> Float[Tensor, "L N A"]:
         """Actions in halves of the actuator's range."""

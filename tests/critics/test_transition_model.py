@@ -46,6 +46,7 @@ def test_predictions_leave_the_range_of_what_was_seen_no_farther_than_told():
     assert stopped.item() == top.item()
     torch.testing.assert_close(free, edge[..., 1] + 0.1, rtol=0, atol=0.03)
 
+
 def test_a_reward_that_was_met_a_few_times_is_remembered():
     """A narrow reward, three times in 500 steps through a wide square."""
     generator = torch.Generator().manual_seed(2)

@@ -1,7 +1,7 @@
 """What each number gives: all-action policy gradients on Pendulum-v1 from batches of 200 steps.
 
     python -m benchmarks.gradient_levers                            every lever for 3,000 environment steps
-    python -m benchmarks.gradient_levers --levers "as preset" --frames 13000 --episodes 100
+    python -m benchmarks.gradient_levers --levers "as preset" --frames 13000 --learners 15 --episodes 100
 
 The preset of `train.py` for this task, and the same with one number changed. After every batch, 40 steps of
 five environments (later every fifth), the deterministic policy plays the same starts, those of Gymnasium's

@@ -75,6 +75,16 @@ def test_who_is_lost_in_imagination_has_not_settled():
     assert not prepared.settled.any()
 
 
+def test_each_learner_takes_its_own_of_two_performances():
+    ours, theirs = performing(-0.7, smooth=True, settled=True), performing(0.4, smooth=False, settled=False)
+    chosen = torch.tensor([True, False, True]).view(LEARNERS, 1, 1)
+    mixed = ours.where(chosen, theirs)
+    for kept in (mixed.smooth, mixed.settled):
+        assert torch.equal(kept, chosen)
+    expected = torch.where(chosen, ours.policy(line()), theirs.policy(line()))
+    torch.testing.assert_close(mixed.policy(line()), expected)
+
+
 def test_a_kept_performance_is_the_same():
     held = performing(-0.7, smooth=True, settled=True)
     kept = Performance.restored(held.state_dict())

@@ -212,3 +212,18 @@ def test_a_plan_that_earns_more_than_what_was_rehearsed_takes_over():
     value.load_state_dict(state, data)
     value.plan(data, torch.zeros(2, 0, 1 + IMAGINED_STEPS, dtype=torch.float64))
     torch.testing.assert_close(value.best_action(grid(), explore=False), before, rtol=0, atol=0.3)
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_who_performs_the_plan_rehearses_only_with_a_model_that_was_fitted_afresh(smooth):
+    data = walk()
+    value = planned(data, discount=0.9, rehearsal=4)
+    state = value.state_dict()
+    state["performance"]["smooth"] = torch.full((2, 1, 1), smooth)
+    bad = -state["performance"]["policy"]["weights"]  # a rehearsal finds better
+    state["performance"]["policy"]["weights"] = bad
+    value.load_state_dict(state, data)
+    nothing = torch.zeros(2, 0, 1 + IMAGINED_STEPS, dtype=torch.float64)
+    for fresh, rehearsed in ((False, smooth), (True, True)):
+        value.plan(data, nothing, fresh=fresh)
+        assert torch.equal(value.state_dict()["performance"]["policy"]["weights"], bad) != rehearsed

@@ -9,6 +9,9 @@ stays; and who has settled on a policy leaves it for a clear gain alone: who hol
 Half of the walks begin where earlier ones were halfway: what fails later than a rehearsal lasts shows in none
 that begins in visited states.
 
+A rehearsal costs several times as much as a plan: who performs the plan rehearses anew only when the model
+was fitted afresh.
+
 A learner has settled if what it performs earns all that the exploring plan Q⁺ hopes for, on the walks that
 last:
 
@@ -68,13 +71,19 @@ class Performance:
     def __init__(self, policy: SmoothPolicy, smooth: Tensor, settled: Tensor, reached: Tensor) -> None:
         self.policy, self.smooth, self.settled, self.reached = policy, smooth, settled, reached
         self._all_smooth = bool(smooth.all())  # then nobody asks the plan
-        self.all_settled = bool(settled.all())
+        self.any_smooth, self.all_settled = bool(smooth.any()), bool(settled.all())
 
     def action(self, observation: Float[Tensor, "L N S"], planned: Map) -> Float[Tensor, "L N A"]:
         """What is performed, in halves of the actuator's range."""
         if self._all_smooth:
             return self.policy(observation)
         return torch.where(self.smooth, self.policy(observation), planned(observation))
+
+    def where(self, chosen: Bool[Tensor, "L 1 1"], other: "Performance") -> "Performance":
+        """This one for the chosen learners, the other for the rest."""
+        policy = self.policy.where(chosen.flatten(), other.policy)
+        pairs = ((self.smooth, other.smooth), (self.settled, other.settled), (self.reached, other.reached))
+        return Performance(policy, *(torch.where(chosen, ours, theirs) for ours, theirs in pairs))
 
     def state_dict(self) -> dict[str, Any]:
         """All that it was made of."""

@@ -92,13 +92,14 @@ class PlannedValue:
     # ---------------------------------------------------------------- planning
 
     @torch.no_grad()
-    def plan(self, data: Transitions, uniform: Float[Tensor, "L I U"]) -> None:
+    def plan(self, data: Transitions, uniform: Float[Tensor, "L I U"], fresh: bool = True) -> None:
         """Plan anew on the model's present beliefs, from the last plan's values.
 
         Args:
             data: the experience that the model has learned.
             uniform: numbers in [0, 1) that choose imagined states: which known state each begins from, and
                 the actions that lead there: U = 1 + 2 A columns.
+            fresh: whether the model was fitted afresh: then all rehearse, else those who gained by it.
         """
         before = self._support
         kernels = self._kernels(data.observation)
@@ -116,10 +117,12 @@ class PlannedValue:
         loc, scale = self.model.loc, self.model.scale
         self._support = Support(observation, scaled, self._ends.labels, loc, scale, prior, none)
         self._iterate(values, self.planning.sweeps * (1 if before is not None else FIRST_SWEEPS))
-        if self.planning.rehearsal:
-            self._rehearse(data.observation)
+        last = self._performance
+        if self.planning.rehearsal and (last is None or fresh or last.any_smooth):
+            prepared = self._rehearsed(data.observation)
+            self._performance = prepared if last is None or fresh else prepared.where(last.smooth, last)
 
-    def _rehearse(self, visited: Float[Tensor, "L N S"]) -> None:
+    def _rehearsed(self, visited: Float[Tensor, "L N S"]) -> Performance:
         """Improve a smooth policy by the model, and choose what is performed."""
         support, planning = self._support, self.planning
         assert support is not None
@@ -134,8 +137,7 @@ class PlannedValue:
             visited,
             NOTHING * (self._high - self._low).squeeze(-1),
         )
-        steps, ascents = planning.rehearsal, planning.ascents
-        self._performance = prepare(imagination, policy, self._performance, steps, ascents)
+        return prepare(imagination, policy, self._performance, planning.rehearsal, planning.ascents)
 
     def _walks(self, start: Float[Tensor, "L N S"], steps: int) -> Walks:
         """Imagined walks by the model, with the plan's value of where they get to."""

@@ -105,7 +105,7 @@ class DynamicProgramming:
         self._planned, self._fitted = steps, steps if fit else self._fitted
         columns = 1 + IMAGINED_STEPS * len(self._half)
         draws = stacked_normal(self._imagination, (config.imagined, columns)).to(data.reward)
-        self.critic.plan(data, torch.special.ndtr(draws))
+        self.critic.plan(data, torch.special.ndtr(draws), fresh=fit)
 
     def _surprise(self, new: Transitions) -> Tensor:
         """Root mean square error of the predicted reward on steps that the model has not seen [L]."""

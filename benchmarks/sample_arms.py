@@ -208,6 +208,7 @@ MAIN = tuple(ARMS)
 # what each part brings: run by name
 BY_CONFIDENCE = ConfidenceScale(noise_scale=100.0, floor=0.1, ceiling=0.6)
 ARMS |= {
+    "dynamic programming, looking ahead": ours("DynamicProgramming", look_ahead=20, rehearsal=0),
     "q-learning, online": ours("QLearning", targets="online"),
     "q-learning, squared exponential": ours("QLearning", kernel="squared-exponential"),
     "q-learning, half the noise": ours("QLearning", std=0.3),

@@ -7,12 +7,13 @@ weigh little: rewards are summed as they come, and the planned value counts for 
 
 A walk goes on as likely as the model sees no end. The best course is begun, and looked at again in the next
 state: compared are the rest of it, variations of that at all scales, and the course of the policy that is at
-hand, so that in imagination nothing worse is performed. (Model predictive control by random
-shooting; Lowrey, Rajeswaran, Kakade, Todorov and Mordatch, 2019, put a learned value at the end.)
+hand, so that in imagination nothing worse is performed. (Model predictive control by random shooting; Lowrey,
+Rajeswaran, Kakade, Todorov and Mordatch, 2019, put a learned value at the end.)
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Float
@@ -97,6 +98,7 @@ class LookAhead:
         return courses.take_along_dim(best[..., None, None, None], 2).squeeze(2)
 
 
+@cache
 def variations(count: int, steps: int, columns: int) -> Float[Tensor, "K H A"]:
     """Smooth deviations from a course, in pairs of both signs, from the widest to the finest.
 

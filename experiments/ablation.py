@@ -32,6 +32,7 @@ ROWS: dict[str, dict[str, object]] = {
     "the plan, Matérn 3/2 value": PLAN | {"smoothness": 1.5},
     "the plan, Matérn 5/2 value": PLAN | {"smoothness": 2.5},
     "the plan, half the support": PLAN | {"support": 100},
+    "the plan, looking ahead": PLAN | {"look_ahead": 20},
 }
 
 

@@ -71,7 +71,8 @@ class Performance:
     def __init__(self, policy: SmoothPolicy, smooth: Tensor, settled: Tensor, reached: Tensor) -> None:
         self.policy, self.smooth, self.settled, self.reached = policy, smooth, settled, reached
         self._all_smooth = bool(smooth.all())  # then nobody asks the plan
-        self.any_smooth, self.all_settled = bool(smooth.any()), bool(settled.all())
+        self.any_smooth = bool(smooth.any())
+        self.any_settled, self.all_settled = bool(settled.any()), bool(settled.all())
 
     def action(self, observation: Float[Tensor, "L N S"], planned: Map) -> Float[Tensor, "L N A"]:
         """What is performed, in halves of the actuator's range."""

@@ -86,8 +86,9 @@ class PlannedValue:
 
     @property
     def settled(self) -> Bool[Tensor, "L 1 1"] | None:
-        """Whether learners have nothing left to explore for; None where nothing is rehearsed."""
-        return None if self._performance is None else self._performance.settled
+        """Whether learners have nothing left to explore for; None if nobody has settled."""
+        performance = self._performance
+        return performance.settled if performance is not None and performance.any_settled else None
 
     # ---------------------------------------------------------------- planning
 

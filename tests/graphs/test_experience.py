@@ -203,15 +203,21 @@ def test_learners_pull_back_apart_and_nothing_seen_changes_nothing():
         torch.testing.assert_close(alone.pulled_back(lengthscale, 0.9), found[learner])
 
 
-def test_folds_leave_whole_trajectories_out_and_never_all():
+def test_half_samples_share_whole_trajectories_out_evenly_and_are_never_empty():
     experience = Experience(2, 80, 10)
-    experience.add(*trajectories(6, 12))
-    number = torch.arange(80) // 12
-    for fold, kept in enumerate(experience.without_folds(3)):
-        assert torch.equal(kept, experience.mask & (number % 3 != fold))
+    experience.add(*trajectories(8, 8))
+    halves = torch.stack(experience.half_samples(6))
+    of_trajectory = halves[:, :64].unflatten(-1, (8, 8))
+    assert (of_trajectory == of_trajectory[..., :1]).all()
+    assert not halves[:, 64:].any()
+    first, second = halves[::2, :64].double(), halves[1::2, :64].double()
+    assert (first + second == 1).all()
+    # every half shares a quarter of the trajectories with each half of every other way to halve them
+    shared = first @ first.mT
+    torch.testing.assert_close(shared, 16.0 * (torch.ones_like(shared) + torch.eye(3)))
     alone = Experience(2, 80, 10)
     alone.add(*trajectories(1, 12))
-    assert all(torch.equal(kept, alone.mask) for kept in alone.without_folds(3))
+    assert all(torch.equal(kept, alone.mask) for kept in alone.half_samples(6))
 
 
 def test_a_trajectory_of_states_and_actions_goes_on_though_another_action_was_taken():
@@ -219,4 +225,4 @@ def test_a_trajectory_of_states_and_actions_goes_on_though_another_action_was_ta
     actions, next_actions = torch.randn(2, 48, 1, dtype=torch.float64)
     experience = Experience(3, 80, 10)
     experience.add(torch.cat([states, actions], -1), torch.cat([next_states, next_actions], -1))
-    assert torch.equal(experience.without_folds(2)[0], experience.mask & (torch.arange(80) // 12 % 2 == 1))
+    assert torch.equal(experience.half_samples(2)[1], experience.mask & (torch.arange(80) // 12 % 2 == 1))

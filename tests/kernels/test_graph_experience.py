@@ -155,14 +155,13 @@ def test_between_states_that_only_distance_joins_a_short_geodesic_is_the_distanc
 def dense_successors(experience: Experience, landmarks: Tensor) -> Tensor:
     """M K_r(·, Z) of every visited state, by a dense inverse; no trajectory's end is followed ahead.
 
-    Ends borrow from three committee members, each of which lacks every third trajectory.
+    Ends borrow from six members of a committee, each of which knows half of the trajectories.
     """
     size = int(experience.size)
     step = torch.zeros(size, size, dtype=torch.float64)
     rows = torch.arange(size).unsqueeze(-1).expand(size, experience.interpolate)
-    for fold in range(3):
-        kept = torch.arange(experience.capacity) // STEPS % 3 != fold
-        after = experience.nearest(experience.next_states[:size], kept & experience.mask)
+    for kept in experience.half_samples(6):
+        after = experience.nearest(experience.next_states[:size], kept)
         nodes, weights = (
             torch.where(experience.ends[:size, None], of_end, inside[:size])
             for of_end, inside in (
@@ -170,7 +169,7 @@ def dense_successors(experience: Experience, landmarks: Tensor) -> Tensor:
                 (after.weight, experience.after_weights),
             )
         )
-        step.index_put_((rows, nodes), weights / 3, accumulate=True)
+        step.index_put_((rows, nodes), weights / 6, accumulate=True)
     step[experience.terminated[:size]] = 0
     rewards = SquaredExponential(2, 0.8)(experience.states[:size], landmarks)
     return torch.linalg.inv(torch.eye(size, dtype=torch.float64) - DISCOUNT * step) @ rewards
@@ -235,21 +234,21 @@ def test_where_the_nearest_states_disagree_the_prior_stays_wide():
     assert undecided(visited) < 1e-9
 
 
-def test_what_one_trajectory_tells_is_doubted_more_than_what_three_tell():
+def test_what_one_trajectory_tells_is_doubted_more_than_what_five_tell():
     """All roads lead down but the topmost, which alone leads up; an input beside it may do either."""
     steps = torch.linspace(0, 4, 13, dtype=torch.float64)
 
     def undecided(upward: int) -> float:
         roads = [torch.stack([steps, 0.1 - 0.01 * k + 0.3 * steps**2], -1) for k in range(upward)]
         roads += [torch.stack([steps, -0.3 - 0.05 * k - 0.3 * steps**2], -1) for k in range(6)]
-        experience = Experience(2, 120, 40, interpolate=2)
+        experience = Experience(2, 140, 40, interpolate=2)
         experience.add(*(torch.cat([road[part] for road in roads]) for part in (slice(-1), slice(1, None))))
         kernel, x = SuccessorKernel(experience, DISCOUNT, 1.0, 1.0, 6), torch.tensor([[0.1, 0.095]]).double()
         kernel.doubt = 1e-9
         return float((kernel.features(x)[1].square() / kernel.diag(x)).detach())
 
     assert undecided(1) > 0.05
-    assert undecided(3) < 0.01
+    assert undecided(5) < 0.01
 
 
 def test_a_mixture_averages_its_rest_and_takes_experience_at_the_mean():

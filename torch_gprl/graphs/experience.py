@@ -64,15 +64,18 @@ class Experience(nn.Module):
         input_dim: int,
         capacity: int,
         landmarks: int = 128,
-        interpolate: int = 4,
-        slope_neighbours: int = 10,
+        interpolate: int = 8,
+        slope_neighbours: int = 20,
         batch_shape: Sequence[int] = (),
     ) -> None:
         super().__init__()
-        if not (1 <= interpolate < capacity and 1 <= slope_neighbours < capacity):
+        if not 1 <= interpolate < capacity:
             raise ValueError(
-                f"interpolate and slope_neighbours must be at least 1 and below the capacity {capacity}, got "
-                f"{interpolate} and {slope_neighbours}"
+                f"interpolate must be at least 1 and below the capacity {capacity}, got {interpolate}"
+            )
+        if not 1 <= slope_neighbours <= capacity:
+            raise ValueError(
+                f"slope_neighbours must be from 1 to the capacity {capacity}, got {slope_neighbours}"
             )
         if not 1 <= landmarks <= capacity:
             raise ValueError(f"landmarks must be from 1 to the capacity {capacity}, got {landmarks}")
@@ -175,16 +178,17 @@ class Experience(nn.Module):
         # some twice if there are too few
         self.landmarks.copy_(chosen[..., torch.arange(self.landmarks.shape[-1]) % chosen.shape[-1]])
 
-    def without_folds(self, count: int) -> list[Bool[Tensor, "*batch C"]]:
-        """All transitions but those of one fold of the trajectories, for each of `count` folds.
+    def half_samples(self, count: int) -> list[Bool[Tensor, "*batch C"]]:
+        """Halves of the trajectories, two of each of count / 2 ways to halve them (McCarthy, 1969).
 
-        Where nothing else is left, all transitions. A trajectory goes on where half of the columns of a row
-        are those that the row before it arrives at: a graph of states and actions stores the policy's action
-        there, not the one that was taken.
+        Member 2j + s has the trajectories whose number has s as its binary digit j, so that any two ways are
+        as different as can be. Where nothing is left, all transitions. A trajectory goes on where half of the
+        columns of a row are those that the row before it arrives at: a graph of states and actions stores the
+        policy's action there, not the one that was taken.
         """
         same = self.next_states[..., :-1, :] == self.states[..., 1:, :]
         number = nn.functional.pad((same.double().mean(-1) < 0.5).cumsum(-1), (1, 0))
-        kept = [self.mask & (number % count != fold) for fold in range(count)]
+        kept = [self.mask & ((number >> member // 2) % 2 == member % 2) for member in range(count)]
         return [torch.where(some.any(-1, keepdim=True), some, self.mask) for some in kept]
 
     def nearest(

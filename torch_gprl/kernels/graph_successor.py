@@ -8,7 +8,7 @@ representation; as a prior of values it is that of Engel et al. (2005) with the 
 Inputs off the graph are followed ahead: x, its expected successor, and so on, for some steps before the last
 one borrows from the vertices near it. That is what finds the side of a ridge on which an input lies. It is a
 hard decision, which one trajectory more or less may turn round. So a committee takes it, each member of which
-lacks a fold of the trajectories (Parmanto, Munro and Doyle, 1996) and looks ahead another time. Where its
+knows half of the trajectories (Bühlmann and Yu, 2002) and looks ahead for a time of its own. Where its
 members, or the vertices that they end at, disagree, the variance that the average loses is kept, and so is a
 part of that of the vertices nearest to the input itself: near a ridge the prior stays wide. Inputs on the
 graph went where they went.
@@ -19,6 +19,7 @@ graph went where they went.
 | Mφ | `vertices` | expected discounted sum of φ from each visited state on |
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -39,7 +40,8 @@ from torch_gprl.linalg import cholesky
 from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
 
 FIRST_DOUBT = 0.1  # until it is set or fitted
-MEMBERS = (0.5, 1.0, 2.0)  # of the committee: how far each follows, in parts of the lookahead
+MEMBERS = 6  # of the committee
+AHEAD = (0.5, 1.0, 2.0)  # how far they follow in turn, in parts of the lookahead
 
 
 class Way(NamedTuple):
@@ -72,8 +74,8 @@ class SuccessorKernel(TableKernel):
         discount: γ of the values that are learned, between 0 and 1.
         lengthscale: of rewards, in units of the inputs; broadcasts to [*batch, D].
         outputscale: σ², prior variance of values; broadcasts to [*batch].
-        lookahead: steps that an input off the graph is followed before it borrows from vertices, by one
-            member of the committee; half as many by another, twice as many by the third.
+        lookahead: steps that an input off the graph is followed before it borrows from vertices, by a
+            third of the committee; half as many by another, twice as many by the last.
 
     Raises:
         ValueError: a discount outside (0, 1), or a negative lookahead.
@@ -190,10 +192,10 @@ class SuccessorKernel(TableKernel):
 
     def _follow(self, x: Tensor) -> list[Way]:
         """The way from x by each member of the committee."""
-        folds = self.experience.without_folds(len(MEMBERS))
+        halves = self.experience.half_samples(MEMBERS)
         return [
             self._follow_among(x, known, int(part * self.lookahead))
-            for known, part in zip(folds, MEMBERS, strict=True)
+            for known, part in zip(halves, itertools.cycle(AHEAD), strict=False)
         ]
 
     def _follow_among(self, x: Tensor, known: Tensor, steps: int) -> Way:
@@ -241,7 +243,9 @@ def _factorise(nodes: Tensor, weights: Tensor) -> SuperLU:
     size, count = nodes.shape
     rows = np.repeat(np.arange(size), count)
     entries = weights.detach().cpu().double().numpy().ravel(), (rows, nodes.cpu().numpy().ravel())
-    return splu(csc_array(eye_array(size) - csc_array(entries, shape=(size, size))))
+    going = csc_array(entries, shape=(size, size))
+    going.eliminate_zeros()  # most transitions arrive at one vertex, and leave nothing to the others
+    return splu(csc_array(eye_array(size) - going))
 
 
 def _solve_sparse(factor: SuperLU, right: Tensor) -> Tensor:

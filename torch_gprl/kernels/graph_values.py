@@ -4,6 +4,8 @@ All parameters come from an ordinary kernel fitted to values, a matter of millis
 the graph and for the rest, and its variance for each of the two. The marginal likelihood of the sum itself
 misleads. Points of one trajectory tell each other nearly all through the graph, so that hardly any variance
 is left for the rest, and states that no trajectory passed are then predicted with far too much confidence.
+The noise is more than that kernel's: where the graph errs, it errs along whole trajectories, whose targets
+count for less than so many independent ones (a tempered likelihood: Grünwald and van Ommen, 2017).
 """
 
 from jaxtyping import Float
@@ -17,6 +19,7 @@ from torch_gprl.kernels.parameters import PositiveValue
 from torch_gprl.kernels.stationary import Matern, Stationary
 
 REWARDS = 2.0  # length scales of rewards, in those of values, which are rougher
+TEMPER = 4.0  # of the noise variance that an ordinary kernel finds
 
 
 class SuccessorWithRest(Sum):
@@ -72,7 +75,8 @@ class SuccessorWithRest(Sum):
     ) -> None:
         """Take length scales, the units of the graph and both variances from an ordinary kernel of values.
 
-        See `Experience.pulled_back`. What a process has learned needs `rebase` afterwards.
+        See `Experience.pulled_back`. What a process has learned needs `rebase` afterwards, and `TEMPER` times
+        the noise variance that was fitted with that kernel.
 
         Args:
             lengthscale: of a kernel like the rest, fitted to values [*batch, D], in units of the inputs.

@@ -107,9 +107,10 @@ ALL_ACTION_REPLAY: dict[str, object] = {
     "replay": 13_000,
     "solved": 3_000,
     "improvements": 10,
+    "budget": 300,
     "damping": 0.05,
-    "noise": 0.001,
-    "lengthscale": 1.0,
+    "noise": 0.03,
+    "lengthscale": 0.5,
 }
 # The same from whole rollouts, where values are rougher: a basis vector for every five steps that are solved,
 # and a noise that keeps them from being learned by heart.

@@ -109,16 +109,20 @@ def test_a_replay_keeps_the_newest_transitions_and_the_critic_knows_no_others():
         assert (figures["outdated"] == 0).all()
 
 
-def test_what_is_solved_of_more_experience_covers_it():
+@pytest.mark.parametrize("count", [70, 40])
+def test_what_is_solved_and_where_the_policy_improves_cover_the_experience(count, monkeypatch):
+    monkeypatch.setattr(teaching, "IMPROVED_STATES", 40)
     made = learner(updates=2, targets="differences", replay=200, solved=70)
     list(made.train())
-    some, everything = made.teacher.solve_anew().squeeze(1), made.experience.all()
-    assert made.critic.gp.observations.tolist() == [some.shape[-1]] * 2 == [70] * 2
+    solved = made.experience.all().gather(1, made.teacher.solved)
+    assert made.critic.gp.observations.tolist() == [solved.shape[-1]] * 2 == [70] * 2
+    some, everything = (solved, made.experience.all()) if count == 70 else (made.teacher.landmarks(), solved)
+    assert some.numel() == 2 * count
     inputs = made.critic.inputs(everything["observation"], everything["action"])
     kept = made.critic.inputs(some["observation"], some["action"]) / inputs.std(1, keepdim=True)
     missed = torch.cdist(inputs / inputs.std(1, keepdim=True), kept).amin(2).amax(1)
     apart = torch.stack([torch.pdist(points).min() for points in kept])
-    assert (missed > 0).all()  # not all experience is solved
+    assert (missed > 0).all()  # not all are chosen
     # a step was left out for one nearer than that, which gave way to one nearer than that
     assert (missed <= 2 * apart).all()
 

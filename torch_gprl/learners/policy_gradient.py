@@ -153,8 +153,7 @@ class PolicyGradient:
             step = self._step_policy(rollout)
             if not taught:
                 self.teacher.teach(rollout, self.updates)
-            for _ in range(self.config.improvements):
-                self._improve()
+            self._improve()
             self.updates += 1
             yield self._figures(rollout, seen) | step
 
@@ -185,12 +184,16 @@ class PolicyGradient:
         return figures
 
     def _improve(self) -> None:
-        """One more step without new experience: the critic solved anew, all actions at remembered states."""
+        """More steps without new experience: the critic solved anew each time, all actions at landmarks."""
+        if not self.config.improvements:
+            return
         assert isinstance(self.teacher, Teacher)
-        remembered, parameters = self.teacher.solve_anew(), self._trained()
-        self.optimiser.zero_grad()
-        self.losses[-1](remembered)["loss_all_action"].backward()
-        self._move(remembered, parameters)
+        landmarks, parameters = self.teacher.landmarks(), self._trained()
+        for _ in range(self.config.improvements):
+            self.teacher.solve_anew()
+            self.optimiser.zero_grad()
+            self.losses[-1](landmarks)["loss_all_action"].backward()
+            self._move(landmarks, parameters)
 
     def _move(self, rollout: TensorDictBase, parameters: list[torch.nn.Parameter]) -> None:
         """Step along the gradient that is set, at states of the rollout."""

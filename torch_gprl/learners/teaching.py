@@ -36,7 +36,7 @@ TUNING_NODES = 60  # of a graph of basis vectors while its kernel is fitted
 FIRST_FIT, LATER_FITS = 50, 20  # steps of the optimiser: later fits start from the last
 GRAPH_FITS_SHORTER = 4  # times: a graph is searched anew at every step
 RENEWED_SHARE = 0.2  # of all experience that is new when scaling and basis are chosen anew
-IMPROVED_STATES = 256  # of all experience, for a step of the policy without a new rollout
+IMPROVED_STATES = 256  # of all experience, for steps of the policy without a new rollout
 FIRST_NOISE = 0.05  # noise variance of standardised targets before the first fit
 REMEMBERED = (
     "observation",
@@ -149,11 +149,14 @@ class Teacher:
             rows = torch.arange(steps, device=every.get("action").device).expand(learners, -1)
         else:
             rows = torch.cat([self.solved, new.to(self.solved.device).expand(learners, -1)], 1)
-        some = every.gather(1, rows)
-        inputs = self.critic.inputs(some.get("observation"), some.get("action"))
-        spread = inputs.std(-2, keepdim=True)
-        chosen = farthest_points(inputs / torch.where(spread > 1e-6, spread, 1.0), count).chosen
+        chosen = self._farthest_apart(every.gather(1, rows), count)
         self.solved = rows.gather(1, chosen.sort(-1).values)
+
+    def _farthest_apart(self, transitions: TensorDictBase, count: int) -> Int[Tensor, "learners count"]:
+        """Rows of transitions [learners, N] whose (s, a) lie farthest apart, in standard deviations."""
+        inputs = self.critic.inputs(transitions.get("observation"), transitions.get("action"))
+        spread = inputs.std(-2, keepdim=True)
+        return farthest_points(inputs / torch.where(spread > 1e-6, spread, 1.0), count).chosen
 
     @torch.no_grad()
     def _scale_values(self, remembered: TensorDictBase) -> None:
@@ -164,11 +167,20 @@ class Teacher:
         critic.target_scale.copy_(torch.where(variance > 0, variance.sqrt(), 1.0) / rest)
         critic.gp.log_noise_variance.fill_(math.log(self.config.noise * rest**2))
 
-    def solve_anew(self) -> TensorDictBase:
-        """Solve the differences of experience under today's policy; some of it [learners, 1, steps]."""
+    def solve_anew(self) -> None:
+        """Solve the differences of experience under today's policy."""
+        self.critic.resolve(self._remembered(), self.policy, self.config.discount)
+
+    def landmarks(self) -> TensorDictBase:
+        """Remembered transitions that lie farthest apart [learners, 1, states], to improve the policy at.
+
+        Most of a good policy's experience is from where it stays. A mean over all of it would leave the
+        policy free, within any trust region, to forget what to do elsewhere.
+        """
         remembered = self._remembered()
-        self.critic.resolve(remembered, self.policy, self.config.discount)
-        return _spread_over(remembered, IMPROVED_STATES).unsqueeze(1)
+        chosen = remembered.gather(1, self._farthest_apart(remembered, IMPROVED_STATES))
+        assert isinstance(chosen, TensorDictBase)
+        return chosen.unsqueeze(1)
 
     def _renew(self, rollout: TensorDictBase, update: int) -> None:
         """Forget, and set scaling and hyper-parameters by this rollout."""

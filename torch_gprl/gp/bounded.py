@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 from torch_gprl.gp.pruning import InformationScore, PruningScore, Whitened, basis_statistics, keep_first
 from torch_gprl.gp.selection import Selection, select_novel
-from torch_gprl.gp.whitened import NOVELTY_FLOOR, WhitenedState
+from torch_gprl.gp.whitened import NOVELTY_FLOOR, WhitenedState, squared_columns
 from torch_gprl.kernels.base import Kernel
 
 # A full basis admits at most one in so many points of a stream: every swap projects the past, but the points
@@ -56,7 +56,7 @@ class BoundedBasis(WhitenedState):
         """Add the novel points of a block to the basis; φ and novelty of all of them, on the new basis."""
         phi = self._features(inputs)
         prior = self.kernel.diag(inputs)
-        novelty = prior - torch.linalg.vecdot(phi, phi, dim=-2)
+        novelty = prior - squared_columns(phi)
         threshold = torch.maximum(self.novelty_threshold * noise, NOVELTY_FLOOR[prior.dtype] * prior)
         candidate = novelty > threshold if mask is None else (novelty > threshold) & mask
         if not bool(candidate.any()):

@@ -88,11 +88,10 @@ def admit_successors(
 
 def _seem_finite(inputs: Tensor, targets: Tensor) -> bool:
     """False if an entry is not finite, or numbers are huge; one synchronisation with the device."""
-    if inputs.device.type != "cpu":
+    if not inputs.is_cpu:
         return math.isfinite(float(inputs.sum() + targets.sum()))
-    # NumPy's calls cost less
-    arrays = (tensor.detach().numpy() for tensor in (inputs, targets))
-    return math.isfinite(sum(float(np.vdot(array, array)) for array in arrays))
+    x, y = inputs.detach().numpy(), targets.detach().numpy()  # NumPy's calls cost less
+    return math.isfinite(np.vdot(x, x) + np.vdot(y, y))
 
 
 def _one_per_input(name: str, tensor: Tensor, inputs: Tensor) -> Tensor:

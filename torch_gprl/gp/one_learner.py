@@ -13,60 +13,61 @@ from torch import Tensor
 from torch_gprl.gp.bounded import YOUTH, BoundedBasis, admissions
 from torch_gprl.gp.observed import Observed
 from torch_gprl.gp.one_point import InUse
-from torch_gprl.gp.whitened import NOVELTY_FLOOR, squared_columns
+from torch_gprl.gp.whitened import NOVELTY_FLOOR
 
 LOG_TWO_PI = math.log(2 * math.pi)
+PerPoint = float | np.ndarray  # the same for all points of a block, or one for each
 LARGE = 128  # rows and points from which a matrix product in parts is faster
 
 
 def absorb(gp: BoundedBasis, block: Observed, noise_variance: float) -> None:
     """Bayes' rule on a block of plain data: grow the basis, absorb every point, prune to the budget."""
-    inputs, targets = _only(block.inputs, 2), _only(block.targets, 1)
-    points = len(inputs)
+    points = block.inputs.shape[-2]
     learn = _absorb_point if points == 1 else _absorb_block
-    rows = learn(gp, inputs, targets, noise_variance)
+    rows = learn(gp, block.inputs, block.targets.detach().numpy().reshape(-1), noise_variance)
     if not gp._stale:
         gp._stale = True
     if rows > gp.capacity - int(gp._room(points)):
         gp._prune(gp.size == rows)
 
 
-def _absorb_block(gp: BoundedBasis, inputs: Tensor, targets: Tensor, noise_variance: float) -> int:
+def _absorb_block(gp: BoundedBasis, inputs: Tensor, targets: np.ndarray, noise_variance: float) -> int:
     """The rows in use afterwards."""
     used = InUse.of(gp)
     phi, prior = used.features(inputs), used.prior
     if prior is None:
-        prior = _only(gp.kernel.diag(inputs), 1)
-    novelty = squared_columns(phi).neg_().add_(prior)
-    threshold = _at_least(gp.novelty_threshold * noise_variance, prior * NOVELTY_FLOOR[phi.dtype])
-    if float((novelty - threshold).amax()) > 0 and (most := _most_additions(gp, len(phi), len(inputs))):
-        phi, novelty = _add_most_novel(gp, inputs, phi, novelty, threshold, most)
+        prior = gp.kernel.diag(inputs).numpy().reshape(-1)
+    novelty = prior - np.square(torch.linalg.vector_norm(phi, dim=0).numpy())
+    threshold = np.maximum(gp.novelty_threshold * noise_variance, NOVELTY_FLOOR[phi.dtype] * prior)
+    if (novelty - threshold).max() > 0 and (most := _most_additions(gp, used, len(novelty))):
+        phi = _add_most_novel(gp, inputs, phi, novelty, threshold, most)
         used = InUse.of(gp)
     # moment: W = 1/(σ0² + ν); dtc ignores what the basis misses
-    variance = novelty.add_(noise_variance) if gp.projection == "moment" else novelty.fill_(noise_variance)
-    scale = variance.rsqrt()
-    phi, targets = phi.mul_(scale), targets * scale
+    variance = (novelty if gp.projection == "moment" else np.zeros_like(novelty)) + noise_variance
+    scale = 1 / np.sqrt(variance)
+    phi.mul_(torch.from_numpy(scale))
+    targets = targets * scale
     _add_gram(used.precision, phi)  # A += Φ W Φᵀ
-    used.information.add_(phi.mv(targets))  # b += Φ W y
-    log_density = float(variance.log_().sum()) + float(targets.dot(targets)) + len(inputs) * LOG_TWO_PI
+    used.information.addmv_(phi, torch.from_numpy(targets))  # b += Φ W y
+    log_density = np.log(variance).sum() + targets.dot(targets) + len(targets) * LOG_TWO_PI
     used.evidence[0] -= 0.5 * log_density
-    used.observations[0] += len(inputs)
+    used.observations[0] += len(targets)
     return len(phi)
 
 
-def _absorb_point(gp: BoundedBasis, point: Tensor, target: Tensor, noise_variance: float) -> int:
+def _absorb_point(gp: BoundedBasis, point: Tensor, target: np.ndarray, noise_variance: float) -> int:
     """`_absorb_block` for one point, in NumPy, whose calls cost a third."""
     used = InUse.of(gp)
-    phi = used.explain(used.covary(point.detach().numpy()[0]))
+    phi = used.explain(used.covary(point.detach().numpy().reshape(-1)))
     prior = used.prior_at(gp, point)
     novelty = prior - float(phi.dot(phi))
     threshold = max(gp.novelty_threshold * noise_variance, NOVELTY_FLOOR[point.dtype] * prior)
-    if novelty > threshold and _most_additions(gp, len(phi), 1):
+    if novelty > threshold and _most_additions(gp, used, 1):
         phi = np.append(phi, np.asarray(math.sqrt(novelty), phi.dtype))
         _append(gp, len(phi) - 1, torch.from_numpy(phi).unsqueeze(0), point)
         used, novelty = InUse.of(gp), 0.0
     weight = 1 / (noise_variance + novelty) if gp.projection == "moment" else 1 / noise_variance
-    observed, column = float(target), torch.from_numpy(phi)
+    observed, column = float(target[0]), torch.from_numpy(phi)
     used.precision.addmm_(column.unsqueeze(1), column.unsqueeze(0), alpha=weight)  # A += φ w φᵀ
     used.information.add_(column, alpha=weight * observed)  # b += φ w y
     used.evidence[0] += 0.5 * (math.log(weight) - weight * observed**2 - LOG_TWO_PI)
@@ -74,13 +75,9 @@ def _absorb_point(gp: BoundedBasis, point: Tensor, target: Tensor, noise_varianc
     return len(phi)
 
 
-def _at_least(least: float, values: float | Tensor) -> float | Tensor:
-    return values.clamp_min(least) if isinstance(values, Tensor) else max(values, least)
-
-
-def _most_additions(gp: BoundedBasis, rows: int, points: int) -> int:
+def _most_additions(gp: BoundedBasis, used: InUse, points: int) -> int:
     """Free growth up to the budget, then the churn, never past the buffers."""
-    before, youth = int(gp.observations), YOUTH * gp.budget
+    rows, before, youth = used.active.rows, int(used.observations[0]), YOUTH * gp.budget
     after = before + points
     group, churn = int(gp._group(points)), 1
     if gp.order == "novelty":
@@ -90,29 +87,31 @@ def _most_additions(gp: BoundedBasis, rows: int, points: int) -> int:
 
 
 def _add_most_novel(
-    gp: BoundedBasis, inputs: Tensor, phi: Tensor, novelty: Tensor, threshold: float | Tensor, most: int
-) -> tuple[Tensor, Tensor]:
-    """Partially pivoted Cholesky of what the basis misses: one row of L, and of Φ, for each point picked."""
+    gp: BoundedBasis, inputs: Tensor, phi: Tensor, novelty: np.ndarray, threshold: PerPoint, most: int
+) -> Tensor:
+    """Partially pivoted Cholesky of what the basis misses: one row of L, and of Φ, for each point picked.
+
+    Returns Φ with the new rows; what is missed, `novelty`, is updated.
+    """
     before = rows = len(phi)
-    features = np.empty((len(inputs), before + most), novelty.numpy().dtype)  # Φᵀ
+    features = np.empty((len(novelty), before + most), novelty.dtype)  # Φᵀ
     features[:, :before] = phi.mT.numpy()
     covariance, pivots = _only(gp.kernel(inputs, inputs), 2).numpy(), list[int]()
-    missed, least = novelty.numpy(), threshold.numpy() if isinstance(threshold, Tensor) else threshold
     while rows < before + most:
-        excess = missed - least
+        excess = novelty - threshold
         pivot = int(excess.argmax())
         if excess[pivot] <= 0:
             break
         row = covariance[pivot] - features[:, :rows] @ features[pivot, :rows]
         row /= math.sqrt(row[pivot])
         features[:, rows] = row
-        missed -= row * row
-        missed[pivot] = 0.0  # nothing is missed of a basis vector
+        novelty -= row * row
+        novelty[pivot] = 0.0  # nothing is missed of a basis vector
         pivots.append(pivot)
         rows += 1
     known = torch.from_numpy(features)[:, :rows]
-    _append(gp, before, known[pivots].tril_(before), inputs[pivots])
-    return known.mT, novelty
+    _append(gp, before, known[pivots].tril_(before), _only(inputs, 2)[pivots])
+    return known.mT
 
 
 def _append(gp: BoundedBasis, before: int, gram_rows: Tensor, points: Tensor) -> None:

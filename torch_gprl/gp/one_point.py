@@ -20,6 +20,8 @@ from torch_gprl.kernels.distance import GaussianBumps
 from torch_gprl.kernels.stationary import Stationary
 
 Map = Callable[[np.ndarray], np.ndarray]
+# x ↦ F⁻¹x for a triangular F
+SOLVE = {np.dtype(name): get_blas_funcs(("trsv",), dtype=name)[0] for name in ("float64", "float32")}
 
 
 class InUse(NamedTuple):
@@ -59,9 +61,9 @@ class InUse(NamedTuple):
         return found
 
     def features(self, inputs: Tensor) -> Tensor:
-        """φ of inputs [N, D] in columns: [R, N]."""
+        """φ of inputs [*1, N, D] in columns: [R, N]."""
         cross = self.active.cross(inputs)
-        cross = cross.view(cross.shape[-2:])
+        cross = cross if cross.ndim == 2 else cross.view(cross.shape[-2:])
         memory = cross if isinstance(self.active.cross, GaussianBumps) else None  # which nobody else holds
         return torch.linalg.solve_triangular(self.gram_factor, cross, upper=False, out=memory)
 
@@ -111,7 +113,7 @@ def _single(cross: Callable[[Tensor], Tensor]) -> Map:
 def _substitution(factor: Tensor) -> Map:
     """The map x [R] ↦ F⁻¹x for a lower triangular F [*1, R, R]; it overwrites x."""
     array = factor.numpy().reshape(factor.shape[-2:])
-    (solve,) = get_blas_funcs(("trsv",), (array,))
+    solve = SOLVE[array.dtype]
     if not len(array):
         return lambda x: x
     if array.flags.f_contiguous:

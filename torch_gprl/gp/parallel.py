@@ -17,7 +17,7 @@ from torch_gprl.gp.door import admit_data
 from torch_gprl.gp.observed import Observed
 from torch_gprl.gp.selection import select_novel
 from torch_gprl.gp.sparse_online import SparseOnlineGP
-from torch_gprl.gp.whitened import NOVELTY_FLOOR
+from torch_gprl.gp.whitened import NOVELTY_FLOOR, squared_columns
 from torch_gprl.kernels.gaussian_inputs import GaussianInputs
 
 
@@ -147,7 +147,7 @@ class ParallelSparseGP(SparseOnlineGP):
     ) -> tuple[Float[Tensor, "*batch R N"], Float[Tensor, "*batch N"], Bool[Tensor, "*batch N"]]:
         """φ and novelty of points, and which of them are novel enough for the basis."""
         phi = self._features(inputs)
-        novelty = self.kernel.diag(inputs) - torch.linalg.vecdot(phi, phi, dim=-2)
+        novelty = self.kernel.diag(inputs) - squared_columns(phi)
         candidate = novelty > self._threshold(inputs, noise)
         return phi, novelty, candidate if mask is None else candidate & mask
 

@@ -83,7 +83,7 @@ class SparseOnlineGP(BoundedBasis):
         if self._kernel_versions() != self._kernel_seen:
             self.rebase()
         if mask is None and next_inputs is None and self._is_alone():
-            absorb = partial(one_learner.absorb, self, noise_variance=float(self.noise_variance))
+            absorb = partial(one_learner.absorb, self, noise_variance=math.exp(self.log_noise_variance))
         else:
             absorb = partial(self._absorb_block, noise=self.noise_variance.unsqueeze(-1))
         points, block = inputs.shape[-2], 1 if self.order == "arrival" else BLOCK

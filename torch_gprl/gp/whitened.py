@@ -269,10 +269,10 @@ class WhitenedState(nn.Module):
     def _versions(self, *names: str) -> tuple[int, ...]:
         """What changes when these buffers do; read where a module keeps them, at half the price."""
         buffers = [self._buffers[name] for name in names]
-        return *(buffer._version for buffer in buffers if buffer is not None), *map(id, buffers)
+        return *[buffer._version for buffer in buffers if buffer is not None], *map(id, buffers)
 
     def _kernel_versions(self) -> tuple[int, ...]:
-        return id(self.kernel), *(tensor._version for tensor in self._kernel_tensors)
+        return id(self._modules["kernel"]), *[tensor._version for tensor in self._kernel_tensors]
 
     def _is_alone(self) -> bool:
         """Whether there is one learner, on the CPU, which may go the short way."""
@@ -281,7 +281,7 @@ class WhitenedState(nn.Module):
 
     def _active(self) -> Active:
         """The rows in use. On a GPU all rows: asking how many are used would wait for the device."""
-        if torch.compiler.is_compiling() or self.size.device.type != "cpu":
+        if torch.compiler.is_compiling() or not self.size.is_cpu:
             cross = partial(self.kernel, self.basis)
             return Active(self.capacity, self.basis, cross, self.gram_factor, self.mask.unsqueeze(-1))
         seen = self._versions("basis", "gram_factor")
@@ -361,8 +361,8 @@ def solve_triangular(factor: Tensor, right: Tensor, upper: bool = False) -> Tens
 
 
 def squared_columns(matrix: Tensor) -> Tensor:
-    """Squared norm of each column [*batch, N]."""
-    return torch.linalg.vecdot(matrix, matrix, dim=-2)
+    """Squared norm of each column [*batch, N], without a copy of the matrix, unlike the sum of a product."""
+    return torch.linalg.vector_norm(matrix, dim=-2).square()
 
 
 def _solve(gram_factor: Tensor, precision: Tensor, information: Tensor) -> Solved:

@@ -59,36 +59,38 @@ class GaussianBumps:
 
     def __init__(self, z: OtherInputs, log_lengthscale: Tensor, log_outputscale: Tensor) -> None:
         with torch.no_grad():
-            self.inverse = log_lengthscale.neg().exp_().unsqueeze(-2)
-            self.centre = z[..., :1, :].to(log_lengthscale.dtype)
-            points = (z - self.centre) * self.inverse
-            square = torch.linalg.vecdot(points, points).unsqueeze(-2)
-            self.columns = points.mT
-            self.peak = torch.sub(log_outputscale[..., None, None], square, alpha=0.5)  # log σ² − ½|z|²/ℓ²
+            weight = log_lengthscale.mul(-2).exp_()  # ℓ⁻²
+            self.centre = z[..., :1, :].to(weight.dtype)
+            points = z - self.centre
+            self.half_weight = weight.mul(0.5).unsqueeze(-1)
+            half_square = (points.square() @ self.half_weight).mT
+            self.columns = (points * weight.unsqueeze(-2)).mT  # z/ℓ²
+            self.peak = log_outputscale[..., None, None] - half_square  # log σ² − ½|z|²/ℓ²
         self._arrays: tuple[np.ndarray, ...] | None = None
 
     def __call__(self, x: Inputs) -> Float[Tensor, "... M N"]:
         """Covariances with x [*batch, N, D]."""
-        x = (x.to(self.peak.dtype) - self.centre) * self.inverse
-        square = torch.linalg.vecdot(x, x).unsqueeze(-1)
-        add_product = {2: torch.addmm, 3: torch.baddbmm}.get(x.ndim)
-        if add_product is not None and x.shape[:-2] == self.columns.shape[:-2]:
-            exponent = add_product(self.peak, x, self.columns)
+        x = x.to(self.peak.dtype) - self.centre
+        exponent = self.peak - x.square() @ self.half_weight
+        if x.ndim == self.columns.ndim == 2:
+            exponent.addmm_(x, self.columns)
+        elif x.ndim == 3 and x.shape[:-2] == self.columns.shape[:-2]:
+            exponent.baddbmm_(x, self.columns)
         else:
-            exponent = self.peak + x @ self.columns
-        return exponent.sub_(square, alpha=0.5).exp_().mT
+            exponent = exponent + x @ self.columns
+        return exponent.exp_().mT
 
     def of_one(self, x: np.ndarray) -> np.ndarray:
         """Covariances [M] with one point x [D], for a batch of one on the CPU: NumPy's calls cost less."""
         if self._arrays is None:
             points = self.columns.mT.reshape(-1, len(x))
-            others = (self.peak, self.centre, self.inverse)
+            others = (self.peak, self.centre, self.half_weight)
             self._arrays = points.numpy(), *(other.numpy().reshape(-1) for other in others)
-        points, peak, centre, inverse = self._arrays
-        x = (x - centre) * inverse
+        points, peak, centre, half_weight = self._arrays
+        x = x - centre
         exponent = points.dot(x)
         exponent += peak
-        exponent -= 0.5 * x.dot(x)
+        exponent -= half_weight.dot(x * x)
         return np.exp(exponent, out=exponent)
 
 

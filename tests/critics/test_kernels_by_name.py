@@ -198,4 +198,4 @@ def test_a_graph_of_states_and_actions_takes_its_parameters_from_a_squared_expon
     kernel = critic.gp.kernel
     assert isinstance(kernel, SuccessorWithRest)
     assert (kernel.rest.lengthscale[:, 0] < 0.5 * kernel.rest.lengthscale[:, 2]).all()
-    torch.testing.assert_close(kernel.told.outputscale, kernel.rest.outputscale)
+    torch.testing.assert_close(kernel.told.outputscale, 2 * kernel.rest.outputscale)

@@ -108,11 +108,12 @@ def test_a_kernel_sees_its_experience_grow_also_without_gradients(make: Make):
     torch.testing.assert_close(kernel(x, x), louder)
 
 
-def test_without_experience_one_kernel_is_ordinary_and_the_other_knows_nothing():
+def test_without_experience_both_kernels_are_ordinary():
     empty, x = Experience(2, 60, 12), inputs(6)
     geodesic = GeodesicKernel(empty, DISCOUNT, 0.8, 1.3)
     torch.testing.assert_close(geodesic(x, x), Matern(2, 0.8, 1.3, smoothness=0.5)(x, x))
-    assert float(SuccessorKernel(empty, DISCOUNT)(x, x).detach().max()) < 1e-10
+    successor = SuccessorKernel(empty, DISCOUNT, 0.8)
+    torch.testing.assert_close(successor(x, x), Matern(2, 0.8, 0.5, smoothness=0.5)(x, x))
 
 
 def test_on_merging_trajectories_the_laplacian_is_the_prior_of_bellman_with_white_rewards():
@@ -243,7 +244,7 @@ def test_what_one_trajectory_tells_is_doubted_more_than_what_five_tell():
         roads += [torch.stack([steps, -0.3 - 0.05 * k - 0.3 * steps**2], -1) for k in range(6)]
         experience = Experience(2, 140, 40, interpolate=2)
         experience.add(*(torch.cat([road[part] for road in roads]) for part in (slice(-1), slice(1, None))))
-        kernel, x = SuccessorKernel(experience, DISCOUNT, 1.0, 1.0, 6), torch.tensor([[0.1, 0.095]]).double()
+        kernel, x = SuccessorKernel(experience, DISCOUNT, 1.0, 1.0, 6), torch.tensor([[0.01, 0.099]]).double()
         kernel.doubt = 1e-9
         return float((kernel.features(x)[1].square() / kernel.diag(x)).detach())
 
@@ -290,7 +291,7 @@ def test_a_mixture_takes_its_parameters_from_an_ordinary_kernel_of_values():
         before = kernel(x, x)
         kernel.suit(ordinary.lengthscale, ordinary.outputscale)
         told = SuccessorKernel(experience, DISCOUNT, 2 * pulled, 0.6)
-        torch.testing.assert_close(kernel(x, x), told(x, x) + ordinary(x, x))
+        torch.testing.assert_close(kernel(x, x), told(x, x) + 0.5 * ordinary(x, x))
         assert not torch.allclose(kernel(x, x), before)
     torch.testing.assert_close(experience.lengthscale, pulled.detach())
 

@@ -10,8 +10,8 @@ one borrows from the vertices near it. That is what finds the side of a ridge on
 hard decision, which one trajectory more or less may turn round. So a committee takes it, each member of which
 knows half of the trajectories (Bühlmann and Yu, 2002) and looks ahead for a time of its own. Where its
 members, or the vertices that they end at, disagree, the variance that the average loses is kept, and so is a
-part of that of the vertices nearest to the input itself: near a ridge the prior stays wide. Inputs on the
-graph went where they went.
+part of that of the vertices nearest to the input itself: near a ridge the prior stays wide. So it does for
+inputs that lie far from all vertices. Inputs on the graph went where they went.
 
 | paper | here | meaning |
 |---|---|---|
@@ -40,6 +40,7 @@ from torch_gprl.linalg import cholesky
 from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
 
 FIRST_DOUBT = 0.1  # until it is set or fitted
+UNSEEN = 0.5  # variance, in parts of σ², that inputs far from all visited states have besides
 MEMBERS = 6  # of the committee
 AHEAD = (0.5, 1.0, 2.0)  # how far they follow in turn, in parts of the lookahead
 
@@ -64,10 +65,12 @@ class Ways(NamedTuple):
 class SuccessorKernel(TableKernel):
     """σ² ((Mφ)(x) (Mφ)(z)ᵀ + what is undecided), of mean prior variance σ² over visited states.
 
-    It knows nothing where there is no experience, and the transitions of others are a guess: add an ordinary
-    kernel, `SuccessorKernel(…) + Matern(…)`, for what it cannot tell. A further parameter, `doubt`, is the
-    part of the disagreement of the nearest states that following an input ahead does not settle. A visited
-    state keeps its vertex: there the kernel is no smooth function of its inputs.
+    It tells nothing where there is no experience, and the transitions of others are a guess: add an ordinary
+    kernel, `SuccessorKernel(…) + Matern(…)`, for what it cannot tell. Undecided is the disagreement of those
+    that speak for an input, and what the nearest visited state leaves open: a part of 1 − exp(−2 d), as of a
+    Matérn 1/2 kernel, at a distance of d. A further parameter, `doubt`, is the part of the disagreement of
+    the nearest states that following an input ahead does not settle. A visited state keeps its vertex: there
+    the kernel is no smooth function of its inputs.
 
     Args:
         experience: visited states and transitions; may grow at any time.
@@ -157,7 +160,8 @@ class SuccessorKernel(TableKernel):
         """F [*batch, N, L], and the root of the variance that is left undecided [*batch, N, 1]."""
         ways, vertices = self._ways(x), table[-1]
         features, spread_here = _agreement(ways.start, vertices)
-        undecided = self.doubt[..., None, None] * spread_here
+        unseen = 1 - (-2 * ways.start.distance[..., :1]).exp()
+        undecided = self.doubt[..., None, None] * spread_here + UNSEEN * unseen
         if ways.committee:
             off = ways.off[..., ways.rows].unsqueeze(-1)
             followed, disputed = self._followed(ways.committee, table)

@@ -1,11 +1,12 @@
 """A prior of values from experience, with an ordinary one for what experience cannot tell.
 
 All parameters come from an ordinary kernel fitted to values, a matter of milliseconds: its length scales for
-the graph and for the rest, and its variance for each of the two. The marginal likelihood of the sum itself
-misleads. Points of one trajectory tell each other nearly all through the graph, so that hardly any variance
-is left for the rest, and states that no trajectory passed are then predicted with far too much confidence.
-The noise is more than that kernel's: where the graph errs, it errs along whole trajectories, whose targets
-count for less than so many independent ones (a tempered likelihood: Grünwald and van Ommen, 2017).
+the graph and for the rest, and its variance, whole for the graph and half for the rest; far from all visited
+states the other half is added. The marginal likelihood of the sum itself misleads. Points of one trajectory
+tell each other nearly all through the graph, so that hardly any variance is left for the rest, and states
+that no trajectory passed are then predicted with far too much confidence. The noise is more than that
+kernel's: where the graph errs, it errs along whole trajectories, whose targets count for less than so many
+independent ones (a tempered likelihood: Grünwald and van Ommen, 2017).
 """
 
 from jaxtyping import Float
@@ -14,11 +15,12 @@ from torch import Tensor
 from torch_gprl.graphs.experience import Experience
 from torch_gprl.kernels.base import Sum
 from torch_gprl.kernels.gaussian_inputs import GaussianInputs
-from torch_gprl.kernels.graph_successor import SuccessorKernel
+from torch_gprl.kernels.graph_successor import UNSEEN, SuccessorKernel
 from torch_gprl.kernels.parameters import PositiveValue
 from torch_gprl.kernels.stationary import Matern, Stationary
 
 REWARDS = 2.0  # length scales of rewards, in those of values, which are rougher
+REST = 1 - UNSEEN  # of the variance of values
 TEMPER = 4.0  # of the noise variance that an ordinary kernel finds
 
 
@@ -80,14 +82,15 @@ class SuccessorWithRest(Sum):
 
         Args:
             lengthscale: of a kernel like the rest, fitted to values [*batch, D], in units of the inputs.
-            outputscale: its prior variance [*batch], given to each of the two parts.
+            outputscale: its prior variance [*batch], given to what experience tells, and half of it to the
+                rest.
         """
         experience = self.told.experience
         experience.measure(experience.pulled_back(lengthscale.detach(), self.told.discount))
         self.told.lengthscale = REWARDS * experience.lengthscale
         self.rest.lengthscale = lengthscale.detach().expand(experience.lengthscale.shape)
-        for kernel in (self.told, self.rest):
-            kernel.outputscale = outputscale
+        self.told.outputscale = outputscale
+        self.rest.outputscale = REST * outputscale
 
     def _expected(self, x: GaussianInputs, z: GaussianInputs) -> Tensor:
         return self.told(x.mean, z.mean) + self.rest.expected(x, z)

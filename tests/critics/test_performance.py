@@ -4,10 +4,11 @@ import torch
 
 from torch_gprl.critics.performance import Imagination, Performance, prepare
 from torch_gprl.critics.rehearsal import SmoothPolicy, Walks
+from torch_gprl.critics.transition_model import Transitions
 
-DISCOUNT, LEARNERS, STEPS = 0.9, 3, 10
+DISCOUNT, LEARNERS, STEPS, COUNT = 0.9, 3, 10, 60
 BEST = 1 / (1 - DISCOUNT)  # value of rewards of 1 for ever
-MARGIN = torch.full((LEARNERS,), 0.1, dtype=torch.float64)
+LOW, HIGH = torch.zeros(LEARNERS, dtype=torch.float64), torch.full((LEARNERS,), BEST, dtype=torch.float64)
 
 
 def line(count: int = 9) -> torch.Tensor:
@@ -26,7 +27,15 @@ def step(states: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, tor
     return following, 1 - following.square().squeeze(-1), end
 
 
-def imagine(planned_gain: float, hoped: float = 10.0) -> Imagination:
+def experience(paid: float, ends: int) -> Transitions:
+    """Visited states, what each step was paid, and so many ends at last."""
+    steps = line(COUNT)
+    ended = torch.zeros_like(steps[..., 0])
+    ended[:, COUNT - ends :] = 1
+    return Transitions(steps, torch.zeros_like(steps), torch.full_like(ended, paid), steps, ended)
+
+
+def imagine(planned_gain: float, hoped: float = 10.0, data: Transitions | None = None) -> Imagination:
     """The plan's actions are so many times the state; exploring hopes for the same everywhere."""
 
     def walks(start: torch.Tensor, steps: int) -> Walks:
@@ -35,12 +44,17 @@ def imagine(planned_gain: float, hoped: float = 10.0) -> Imagination:
     def plan(states: torch.Tensor) -> torch.Tensor:
         return (planned_gain * states).clamp(-1, 1)
 
-    return Imagination(walks, plan, plan, lambda states: 0 * states[..., 0] + hoped, line(40), MARGIN)
+    def hope(states: torch.Tensor) -> torch.Tensor:
+        return torch.full_like(states[..., 0], hoped)
+
+    seen = experience(paid=0, ends=1) if data is None else data
+    return Imagination(walks, plan, plan, hope, seen, LOW, HIGH, DISCOUNT)
 
 
-def performing(gain: float, smooth: bool, settled: bool) -> Performance:
+def performing(gain: float, smooth: bool, settled: bool, since: int = COUNT) -> Performance:
     mask = torch.ones(LEARNERS, 1, 1, dtype=torch.bool)
-    return Performance(policy(gain), mask & smooth, mask & settled, line(8))
+    kept = torch.full((LEARNERS, 1, 1), float(since), dtype=torch.float64)
+    return Performance(policy(gain), mask & smooth, mask & settled, line(8), kept)
 
 
 def test_the_better_of_plan_and_policy_is_performed():
@@ -62,6 +76,28 @@ def test_only_who_has_settled_keeps_a_policy_that_is_as_good_as_the_plan():
         held = performing(-1.8, smooth=True, settled=settled)
         prepared = prepare(imagine(-1.9), policy(), held, STEPS, ascents=0)
         assert (prepared.smooth == settled).all()
+
+
+def test_a_settled_policy_that_lasts_in_reality_is_kept_whatever_is_imagined():
+    # in imagination the held policy leaves the line, and the plan goes to the best place at once
+    for ends, since, paid, settled, kept in (
+        (2, 0, 1.0, True, True),  # 60 steps, twice an end: 20 steps each
+        (3, 0, 1.0, True, False),
+        (0, COUNT - 2 * STEPS, 1.0, True, True),
+        (0, COUNT - 2 * STEPS + 1, 1.0, True, False),  # it was another policy that lasted
+        (0, 0, 0.98, True, False),  # there is more to earn
+        (0, 0, 1.0, False, False),
+    ):
+        held = performing(3.0, smooth=True, settled=settled, since=since)
+        imagination = imagine(-1.9, data=experience(paid, ends))
+        prepared = prepare(imagination, policy(), held, STEPS, ascents=0)
+        assert torch.equal(prepared.action(line(5), torch.zeros_like), held.policy(line(5))) == kept
+
+
+def test_a_policy_is_kept_since_it_was_settled_on():
+    held = performing(-1.8, smooth=True, settled=True, since=3)
+    assert (prepare(imagine(-1.9), policy(), held, STEPS, ascents=0).since == 3).all()
+    assert (prepare(imagine(-1.9), policy(), None, STEPS, ascents=0).since == COUNT).all()
 
 
 def test_who_earns_what_is_hoped_for_has_settled():

@@ -48,7 +48,6 @@ VALUE_NOISE, NOVELTY_NOISE = 1e-3, 1e-2  # of regressions under kernels of varia
 IMAGINED_STEPS = 2  # from a known state to an imagined one
 FIRST_SWEEPS = 3  # times as many as later: those begin from the last value
 FAR = 1.0  # ranges of what was seen by which walks may leave it: its edge is no wall to lean on
-NOTHING = 0.01  # share of the range of values that is not worth exploring for
 CHUNK = 2**22  # numbers of the largest temporary: bounds the memory
 
 
@@ -120,14 +119,14 @@ class PlannedValue:
         self._iterate(values, self.planning.sweeps * (1 if before is not None else FIRST_SWEEPS))
         last = self._performance
         if self.planning.rehearsal and (last is None or fresh or last.any_smooth):
-            prepared = self._rehearsed(data.observation)
+            prepared = self._rehearsed(data)
             self._performance = prepared if last is None or fresh else prepared.where(last.smooth, last)
 
-    def _rehearsed(self, visited: Float[Tensor, "L N S"]) -> Performance:
+    def _rehearsed(self, data: Transitions) -> Performance:
         """Improve a smooth policy by the model, and choose what is performed."""
         support, planning = self._support, self.planning
         assert support is not None
-        pool = torch.cat([support.observation, spread(visited, planning.support)], 1)
+        pool = torch.cat([support.observation, spread(data.observation, planning.support)], 1)
         chosen = farthest_points(self._scaled(pool), planning.support).chosen
         policy = SmoothPolicy(pool.take_along_dim(chosen.unsqueeze(-1), 1), support.loc, support.scale)
         imagination = Imagination(
@@ -135,8 +134,10 @@ class PlannedValue:
             lambda states: self._best_of(self.acting_actions, states, explore=False),
             lambda states: self._best_of(self._backup_actions, states, explore=False),
             lambda states: self.candidate_values(states, explore=True).amax(-1),
-            visited,
-            NOTHING * (self._high - self._low).squeeze(-1),
+            data,
+            self._low.squeeze(-1),
+            self._high.squeeze(-1),
+            planning.discount,
         )
         return prepare(imagination, policy, self._performance, planning.rehearsal, planning.ascents)
 

@@ -99,12 +99,12 @@ class BoundedBasis(WhitenedState):
 
     def _churn(self, points: int | Tensor) -> Tensor:
         """Most additions to a full basis from the next points, of each learner."""
-        before, youth = self.observations, YOUTH * self.budget
         if self.order == "arrival":
-            return torch.ones_like(before)
-        after, group = before + points, self._group(points)
-        early, late = before.clamp_max(youth), after.clamp_max(youth)
-        return admissions(after, late, youth, group) - admissions(before, early, youth, group)
+            return torch.ones_like(self.observations)
+        youth = YOUTH * self.budget
+        seen = torch.stack([self.observations, self.observations + points])
+        before, after = admissions(seen, seen.clamp_max(youth), youth, self._group(points))
+        return after - before
 
     def _group(self, points: int | Tensor) -> int | Tensor:
         """How many additions to a full basis come at once, from a block of so many points."""

@@ -128,21 +128,21 @@ class SparseOnlineGP(BoundedBasis):
             self._prune(full)
 
     def _accumulate(self, phi: Tensor, variance: Tensor, targets: Tensor, mask: Tensor | None) -> None:
-        """A += Φ W Φᵀ, b += Φ W y, and the constant of the evidence, with W = 1/variance."""
+        """A += Φ W Φᵀ, b += Φ W y, and the constant of the evidence, with W = 1/variance; overwrites Φ."""
         weight, count = variance.reciprocal(), targets.shape[-1]
         log_weight = weight.log()
         if mask is not None:
             weight, log_weight, count = weight * mask, log_weight * mask, mask.sum(-1)
-        scaled = phi * weight.sqrt().unsqueeze(-2)
-        weighted = weight * targets
+        scale = weight.sqrt()
+        scaled, observed = phi.mul_(scale.unsqueeze(-2)), scale * targets
         precision = self.precision[..., : phi.shape[-2], : phi.shape[-2]]
         add_product = {2: precision.addmm_, 3: precision.baddbmm_}.get(phi.ndim)
         if add_product is None:
             precision.add_(scaled @ scaled.mT)
         else:
             add_product(scaled, scaled.mT)
-        self.information[..., : phi.shape[-2]].add_((phi @ weighted.unsqueeze(-1)).squeeze(-1))
-        quadratic = torch.linalg.vecdot(weighted, targets)
+        self.information[..., : phi.shape[-2]].add_((observed.unsqueeze(-2) @ scaled.mT).squeeze(-2))
+        quadratic = torch.linalg.vecdot(observed, observed)
         self.evidence_constant.add_(0.5 * (log_weight.sum(-1) - quadratic - count * LOG_TWO_PI))
         self.observations.add_(count)
         self._stale = True

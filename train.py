@@ -107,6 +107,7 @@ ALL_ACTION_REPLAY: dict[str, object] = {
     "replay": 13_000,
     "solved": 3_000,
     "improvements": 10,
+    "average_over": 10,
     "budget": 300,
     "damping": 0.05,
     "noise": 0.03,

@@ -164,7 +164,11 @@ DIFFERENCES = {"targets": "differences", "estimator": "all-action"}
 
 @pytest.mark.parametrize(
     "numbers",
-    [DIFFERENCES, DIFFERENCES | {"replay": 150, "solved": 60, "improvements": 3}, {"critic": "neural"}],
+    [
+        DIFFERENCES,
+        DIFFERENCES | {"replay": 150, "solved": 60, "improvements": 3, "average_over": 5},
+        {"critic": "neural"},
+    ],
     ids=str,
 )
 def test_a_saved_run_goes_on_as_it_would_have(numbers):
@@ -192,6 +196,7 @@ def test_a_saved_run_goes_on_as_it_would_have(numbers):
         ({"replay": 9, "targets": "differences", "discount": 1.0}, "replay needs a discount between 0 and 1"),
         ({"damping": 0.0}, "damping must be positive"),
         ({"improvements": 2}, "improvements need a replay, estimator 'all-action'"),
+        ({"average_over": 5, "exploration": "gibbs"}, "'gibbs' .* needs average_over 1, got 5"),
         ({"replay": -1}, "replay must be at least 0"),
         ({"age_weight": 1.5}, "age_weight must lie between 0 and 1, got 1.5"),
         ({"noise": 0.0}, "noise must be positive"),

@@ -46,6 +46,7 @@ LEAST = {
     "replay": 0,
     "solved": 1,
     "improvements": 0,
+    "average_over": 1,
 }
 POSITIVE = (
     "std",
@@ -88,6 +89,7 @@ class PolicyGradientConfig:
     trust_region: float = 0.05  # KL divergence of the first natural step, nats; falls linearly to 0
     damping: float = 1e-3  # of the natural gradient: shares of the mean Fisher information along the gradient
     learning_rate: float = 0.01  # of Adam and of the plain gradient; falls linearly to 0
+    average_over: int = 1  # steps of the policy whose mean acts when nothing is explored; 1: the newest
 
     targets: Targets = "returns"  # the critic learns values from returns, or rewards as temporal differences
     in_sample: bool = False  # the critic learns a rollout before it judges it
@@ -115,6 +117,7 @@ class PolicyGradientConfig:
         check_ranges(self, least=LEAST, positive=POSITIVE, shares=SHARES)
         check_choices(self, CHOICES)
         self._check_combinations()
+        self._check_exploration()
 
     def _check_combinations(self) -> None:
         if self.replay and self.targets != "differences":
@@ -135,14 +138,21 @@ class PolicyGradientConfig:
             )
         if self.critic == "neural" and self.estimator == "k-step-baseline" and self.horizon == 0:
             raise ValueError("critic 'neural' needs at least one real reward: horizon 1 or more, got 0")
-        if self.exploration in GUIDED and self.critic != "gp":
-            raise ValueError(
-                f"exploration {self.exploration!r} asks the variance or the values of critic 'gp'"
-            )
-        if self.exploration == "gibbs" and self.estimator in USE_ALL_ACTIONS:
-            raise ValueError(f"estimator {self.estimator!r} averages over a normal policy, not over gibbs")
         if self.optimiser == "episodic-natural" and self.estimator != "return":
             raise ValueError(
                 "optimiser 'episodic-natural' regresses returns of episodes and needs estimator 'return', "
                 f"got {self.estimator!r}"
             )
+
+    def _check_exploration(self) -> None:
+        if self.exploration in GUIDED and self.critic != "gp":
+            raise ValueError(
+                f"exploration {self.exploration!r} asks the variance or the values of critic 'gp'"
+            )
+        if self.exploration in GUIDED and self.average_over > 1:
+            raise ValueError(
+                f"exploration {self.exploration!r} acts by the newest parameters and needs average_over 1, "
+                f"got {self.average_over}"
+            )
+        if self.exploration == "gibbs" and self.estimator in USE_ALL_ACTIONS:
+            raise ValueError(f"estimator {self.estimator!r} averages over a normal policy, not over gibbs")

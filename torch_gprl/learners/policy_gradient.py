@@ -34,6 +34,7 @@ from torch_gprl.objectives import (
     step_along,
 )
 from torch_gprl.policies import (
+    AveragedPolicy,
     ConfidenceNoise,
     ConfidenceScale,
     Controller,
@@ -73,6 +74,8 @@ class PolicyGradient:
         )
         self.controller = controller.to(env.device)
         gaussian = gaussian_policy(controller, env.action_spec, config.std, seed, learners=indices)
+        if config.average_over > 1:
+            gaussian = AveragedPolicy(gaussian.head, gaussian.noise, config.average_over)
         gaussian.to(env.device)
         gaussian.head.log_std.requires_grad_(config.exploration == "learned")
         self.teacher = self._teacher(gaussian, seed, first_learner)
@@ -207,6 +210,8 @@ class PolicyGradient:
         else:
             self.optimiser.param_groups[0]["lr"] = self.config.learning_rate * left
             self.optimiser.step()
+        if isinstance(self.policy, AveragedPolicy):
+            self.policy.follow()
 
     def _anneal(self, done: float) -> None:
         """Set what changes in the exploration by a schedule, for a share of the training that is over."""

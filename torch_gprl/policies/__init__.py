@@ -1,5 +1,6 @@
 """Policies: deterministic controllers f(s, θ) and the exploration round them."""
 
+from torch_gprl.policies.averaged import AveragedPolicy
 from torch_gprl.policies.behaviour import Behaviour, BehaviourPolicy, Scheme
 from torch_gprl.policies.confidence_noise import ConfidenceNoise, ConfidenceScale, Greedy, action_box
 from torch_gprl.policies.controllers import (
@@ -16,6 +17,7 @@ from torch_gprl.policies.planned import PlannedBehaviour, PlannedPolicy, Planned
 from torch_gprl.policies.streams import NoiseStream
 
 __all__ = [
+    "AveragedPolicy",
     "Behaviour",
     "BehaviourPolicy",
     "ConfidenceNoise",

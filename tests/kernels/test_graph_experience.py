@@ -26,7 +26,7 @@ Make = Callable[[Experience], TableKernel]
 KINDS: dict[str, Make] = {
     "geodesic": lambda experience: GeodesicKernel(experience, DISCOUNT, 0.8, 1.3, 4),
     "successor": lambda experience: SuccessorKernel(experience, DISCOUNT, 0.8, 1.3, 0),
-    "successor, ahead": lambda experience: SuccessorKernel(experience, DISCOUNT, 0.8, 1.3, 3),
+    "successor, ahead": lambda experience: SuccessorKernel(experience, DISCOUNT, 0.8, 1.3, 3, 0.5),
 }
 
 
@@ -112,7 +112,7 @@ def test_without_experience_both_kernels_are_ordinary():
     empty, x = Experience(2, 60, 12), inputs(6)
     geodesic = GeodesicKernel(empty, DISCOUNT, 0.8, 1.3)
     torch.testing.assert_close(geodesic(x, x), Matern(2, 0.8, 1.3, smoothness=0.5)(x, x))
-    successor = SuccessorKernel(empty, DISCOUNT, 0.8)
+    successor = SuccessorKernel(empty, DISCOUNT, 0.8, unseen=0.5)
     torch.testing.assert_close(successor(x, x), Matern(2, 0.8, 0.5, smoothness=0.5)(x, x))
 
 
@@ -270,6 +270,8 @@ def test_options_out_of_range_are_named():
         GeodesicKernel(experience, 0.9, spatial_edges=60)
     with pytest.raises(ValueError, match="lookahead must be at least 0"):
         SuccessorKernel(experience, 0.9, lookahead=-1)
+    with pytest.raises(ValueError, match="unseen must be a variance of at least 0"):
+        SuccessorKernel(experience, 0.9, unseen=-0.1)
 
 
 def test_leading_dimensions_beyond_the_batch_are_more_inputs_of_the_same_learners(make: Make):
@@ -290,7 +292,7 @@ def test_a_mixture_takes_its_parameters_from_an_ordinary_kernel_of_values():
     with torch.no_grad():
         before = kernel(x, x)
         kernel.suit(ordinary.lengthscale, ordinary.outputscale)
-        told = SuccessorKernel(experience, DISCOUNT, 2 * pulled, 0.6)
+        told = SuccessorKernel(experience, DISCOUNT, 2 * pulled, 0.6, unseen=0.5)
         torch.testing.assert_close(kernel(x, x), told(x, x) + 0.5 * ordinary(x, x))
         assert not torch.allclose(kernel(x, x), before)
     torch.testing.assert_close(experience.lengthscale, pulled.detach())

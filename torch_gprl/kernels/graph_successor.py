@@ -40,7 +40,6 @@ from torch_gprl.linalg import cholesky
 from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
 
 FIRST_DOUBT = 0.1  # until it is set or fitted
-UNSEEN = 0.5  # variance, in parts of σ², that inputs far from all visited states have besides
 MEMBERS = 6  # of the committee
 AHEAD = (0.5, 1.0, 2.0)  # how far they follow in turn, in parts of the lookahead
 
@@ -66,11 +65,9 @@ class SuccessorKernel(TableKernel):
     """σ² ((Mφ)(x) (Mφ)(z)ᵀ + what is undecided), of mean prior variance σ² over visited states.
 
     It tells nothing where there is no experience, and the transitions of others are a guess: add an ordinary
-    kernel, `SuccessorKernel(…) + Matern(…)`, for what it cannot tell. Undecided is the disagreement of those
-    that speak for an input, and what the nearest visited state leaves open: a part of 1 − exp(−2 d), as of a
-    Matérn 1/2 kernel, at a distance of d. A further parameter, `doubt`, is the part of the disagreement of
-    the nearest states that following an input ahead does not settle. A visited state keeps its vertex: there
-    the kernel is no smooth function of its inputs.
+    kernel, `SuccessorKernel(…) + Matern(…)`, for what it cannot tell. A further parameter, `doubt`, is the
+    part of the disagreement of the nearest states that following an input ahead does not settle. A visited
+    state keeps its vertex: there the kernel is no smooth function of its inputs.
 
     Args:
         experience: visited states and transitions; may grow at any time.
@@ -79,14 +76,17 @@ class SuccessorKernel(TableKernel):
         outputscale: σ², prior variance of values; broadcasts to [*batch].
         lookahead: steps that an input off the graph is followed before it borrows from vertices, by a
             third of the committee; half as many by another, twice as many by the last.
+        unseen: variance in parts of σ² that inputs far from all visited states have besides, of which a
+            visited state at a distance of d leaves 1 − exp(−2 d), as with a Matérn 1/2 kernel.
 
     Raises:
-        ValueError: a discount outside (0, 1), or a negative lookahead.
+        ValueError: a discount outside (0, 1), a negative lookahead or variance.
     """
 
     lengthscale = Positive()
     outputscale = Positive()
     doubt = Positive()
+    unseen: Float[Tensor, ""]
 
     def __init__(
         self,
@@ -95,15 +95,19 @@ class SuccessorKernel(TableKernel):
         lengthscale: PositiveValue = 1.0,
         outputscale: PositiveValue = 1.0,
         lookahead: int = 20,
+        unseen: float = 0.0,
     ) -> None:
         batch, dims = experience.states.shape[:-2], experience.states.shape[-1]
         super().__init__(dims, batch)
         check_discount(discount)
         if lookahead < 0:
             raise ValueError(f"lookahead must be at least 0 steps, got {lookahead}")
+        if unseen < 0:
+            raise ValueError(f"unseen must be a variance of at least 0, got {unseen}")
         self.log_lengthscale = log_parameter(lengthscale, "lengthscale", (*batch, dims))
         self.log_outputscale = log_parameter(outputscale, "outputscale", batch)
         self.log_doubt = log_parameter(FIRST_DOUBT, "doubt", batch)
+        self.register_buffer("unseen", experience.states.new_tensor(unseen))
         self.experience = experience
         self.discount = discount
         self.lookahead = lookahead
@@ -160,8 +164,8 @@ class SuccessorKernel(TableKernel):
         """F [*batch, N, L], and the root of the variance that is left undecided [*batch, N, 1]."""
         ways, vertices = self._ways(x), table[-1]
         features, spread_here = _agreement(ways.start, vertices)
-        unseen = 1 - (-2 * ways.start.distance[..., :1]).exp()
-        undecided = self.doubt[..., None, None] * spread_here + UNSEEN * unseen
+        left = 1 - (-2 * ways.start.distance[..., :1]).exp()  # by the nearest visited state
+        undecided = self.doubt[..., None, None] * spread_here + self.unseen * left
         if ways.committee:
             off = ways.off[..., ways.rows].unsqueeze(-1)
             followed, disputed = self._followed(ways.committee, table)

@@ -15,12 +15,12 @@ from torch import Tensor
 from torch_gprl.graphs.experience import Experience
 from torch_gprl.kernels.base import Sum
 from torch_gprl.kernels.gaussian_inputs import GaussianInputs
-from torch_gprl.kernels.graph_successor import UNSEEN, SuccessorKernel
+from torch_gprl.kernels.graph_successor import SuccessorKernel
 from torch_gprl.kernels.parameters import PositiveValue
 from torch_gprl.kernels.stationary import Matern, Stationary
 
 REWARDS = 2.0  # length scales of rewards, in those of values, which are rougher
-REST = 1 - UNSEEN  # of the variance of values
+REST = 0.5  # of the variance of values
 TEMPER = 4.0  # of the noise variance that an ordinary kernel finds
 
 
@@ -83,7 +83,7 @@ class SuccessorWithRest(Sum):
         Args:
             lengthscale: of a kernel like the rest, fitted to values [*batch, D], in units of the inputs.
             outputscale: its prior variance [*batch], given to what experience tells, and half of it to the
-                rest.
+                rest; the other half to inputs far from all experience.
         """
         experience = self.told.experience
         experience.measure(experience.pulled_back(lengthscale.detach(), self.told.discount))
@@ -91,6 +91,7 @@ class SuccessorWithRest(Sum):
         self.rest.lengthscale = lengthscale.detach().expand(experience.lengthscale.shape)
         self.told.outputscale = outputscale
         self.rest.outputscale = REST * outputscale
+        self.told.unseen.fill_(1 - REST)
 
     def _expected(self, x: GaussianInputs, z: GaussianInputs) -> Tensor:
         return self.told(x.mean, z.mean) + self.rest.expected(x, z)

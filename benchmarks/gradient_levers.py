@@ -9,7 +9,7 @@ seeds 1000, 1001, ... A learner has solved the task at the first of three evalua
 above; a relapse is a later evaluation below.
 
 Every five learners leave a record in --out; a rerun skips what is there, and shows all in a table and a
-picture.
+picture. A call that would last too long stops after --minutes, and the next one goes on.
 """
 
 import json
@@ -35,27 +35,24 @@ TASK, THRESHOLD = "Pendulum-v1", -200.0
 SIDE_BY_SIDE = 5  # learners of one record
 COLOURS = 10  # of a picture's lines before they repeat
 WATCHED = 3_000  # environment steps after each batch of which policies are played; later after every fifth
+NO_MEAN = {"average_over": 1}  # of parameters: steps that are few are too far apart for it
 LEVERS: dict[str, dict[str, Any]] = {
     "as preset": {},
+    "the newest parameters act": NO_MEAN,
     "one episode per batch": {"num_envs": 1, "rollout_steps": 200},
-    "one step of the policy per batch": {"improvements": 0},
+    "one step of the policy per batch": NO_MEAN | {"improvements": 0},
     "undamped natural steps": {"damping": 1e-3},
     "learned exploration": {"exploration": "learned"},
     "discount 0.98": {"discount": 0.98},
     "the newest 1,000 steps alone": {"replay": 1_000},
-    "the newest 4,000, noise 0.005": {"replay": 4_000, "solved": 4_000, "noise": 0.005},
-    "noise of differences 0.02": {"noise": 0.02},
-    "state length scales 0.3": {"lengthscale": 0.3},
+    "noise of differences 0.001": {"noise": 0.001},
+    "noise of differences 0.1": {"noise": 0.1},
+    "state length scales 1": {"lengthscale": 1.0},
     "unit action length scale": {"action_lengthscale": 1.0},
-    "half the basis": {"budget": 75},
-    "smaller trust region": {"trust_region": 0.01},
-    "generalised advantages, no replay": {
-        "estimator": "generalised",
-        "improvements": 0,
-        "replay": 0,
-        "rollout_steps": 200,
-        "num_envs": 1,
-    },
+    "half the basis": {"budget": 150},
+    "half the basis, length scales 1, noise 0.001": {"budget": 150, "lengthscale": 1.0, "noise": 0.001},
+    "generalised advantages, no replay": NO_MEAN
+    | {"estimator": "generalised", "improvements": 0, "replay": 0, "rollout_steps": 200, "num_envs": 1},
 }
 
 
@@ -67,6 +64,7 @@ class Options:
     frames: int = 3_000  # environment steps per learner
     learners: int = 10  # of each lever
     episodes: int = 30  # of an evaluation
+    minutes: float = 600.0  # of this call
     out: Path = Path("benchmarks/results/gradient_levers")  # where records, table and picture go
 
 
@@ -74,38 +72,52 @@ def main(options: Options) -> None:
     """Run what has no record yet; print, write, draw."""
     torch.set_num_threads(1)
     (options.out / "records").mkdir(parents=True, exist_ok=True)
+    ends = time.monotonic() + 60 * options.minutes
     for name in options.levers:
         if name not in LEVERS:
             raise SystemExit(f"unknown lever {name!r}; choose from {', '.join(LEVERS)}")
         for first in range(0, options.learners, SIDE_BY_SIDE):
             path = options.out / "records" / f"{name.replace(' ', '-')}-{options.frames}-{first}.json"
-            if not path.exists():
-                path.write_text(json.dumps(run(name, first, options)) + "\n", encoding="utf-8")
+            if not path.exists() and time.monotonic() < ends:
+                run(name, first, options, path, ends)
     records = read(options.out / "records")
+    if not records:
+        raise SystemExit(f"no record is complete yet in {options.out}: call again")
     table = "\n".join([HEADER, *map(row, records)])
     print(table)
     (options.out / "table.md").write_text(table + "\n", encoding="utf-8")
     save_figure(draw(records), options.out / "learning_curves.png")
 
 
-def run(lever: str, first: int, options: Options) -> dict[str, Any]:
-    """Returns of the deterministic policies after every batch, [batches, learners]."""
+def run(lever: str, first: int, options: Options, path: Path, ends: float) -> None:
+    """Leave a record in `path`: returns of the deterministic policies after every batch, [batches, learners].
+
+    Past the time `ends` the run's state is left beside it, where the next call finds it.
+    """
     numbers: dict[str, Any] = {"num_envs": 5, **POLICY_GRADIENT_PRESETS[TASK], **LEVERS[lever]}
     count, num_envs = min(SIDE_BY_SIDE, options.learners - first), numbers.pop("num_envs")
     env = envs.make(TASK, learners=count, num_envs=num_envs, seed=0, first_learner=first, threads=1)
     # the schedule is that of a long run, however early this one stops
     learner = PolicyGradient(env, PolicyGradientConfig(**numbers), first_learner=first)
     starts = FixedStarts(TASK, count, options.episodes)
-    frames, returns, since = [], [], time.process_time()
+    unfinished, since = path.with_suffix(".pt"), time.process_time()
+    record: dict[str, Any] = {"lever": lever, "frames": [], "returns": [], "cpu_seconds": 0.0}
+    if unfinished.exists():
+        state = torch.load(unfinished, weights_only=True)
+        learner.load_state_dict(state["learner"])
+        record = state["record"]
     for _ in learner.train():
-        if learner.frames > WATCHED and learner.updates % 5:
-            continue
-        frames.append(learner.frames)
-        returns.append(evaluate(starts, learner.policy).mean(-1).tolist())
-        if learner.frames >= options.frames:
+        if learner.frames <= WATCHED or learner.updates % 5 == 0:
+            record["frames"].append(learner.frames)
+            record["returns"].append(evaluate(starts, learner.policy).mean(-1).tolist())
+        if learner.frames >= options.frames or time.monotonic() > ends:
             break
-    seconds = (time.process_time() - since) / count
-    return {"lever": lever, "frames": frames, "returns": returns, "cpu_seconds": [seconds] * len(frames)}
+    record["cpu_seconds"] += (time.process_time() - since) / count
+    if learner.frames < options.frames:
+        torch.save({"learner": learner.state_dict(), "record": record}, unfinished)
+        return
+    path.write_text(json.dumps(record) + "\n", encoding="utf-8")
+    unfinished.unlink(missing_ok=True)
 
 
 def read(folder: Path) -> list[dict[str, Any]]:
@@ -128,7 +140,7 @@ HEADER = """\
 
 def row(record: dict[str, Any]) -> str:
     """One line of the table; relapses are the share of evaluations after the task was solved."""
-    seeds = list(outcomes([record], THRESHOLD))
+    seeds = list(outcomes([record | {"cpu_seconds": record["frames"]}], THRESHOLD))
     steps = sorted(seed["frames"] for seed in seeds)
     solved = [seed["relapses"] for seed in seeds if seed["frames"] != NEVER]
     relapses = f"{np.mean(solved):.0%}" if solved else "–"

@@ -7,8 +7,9 @@ to be wrong about. Here one process guides a policy, and the others are taught t
 else. Right after every update of the policy all of them say what actions are worth in fresh episodes of the
 new one. The truth is the return that follows, counted on behind the time limit until the discount leaves 2 %.
 
-Root mean square errors over the second half of the updates, and by how much each is below that of the process
-that is estimated anew, learner by learner, go to --results.
+Every five learners leave their errors in --out, where a later call finds them. Root mean squares over the
+second half of the updates, and by how much each is below that of the process that is estimated anew, learner
+by learner, go to --results.
 """
 
 import dataclasses
@@ -42,6 +43,8 @@ WAYS: dict[str, dict[str, Any]] = {name: CLAIM_2[name] for name in NAMES} | {
 STEPS, TAIL = 200, 200  # of a judged episode, and behind it: γ^200 is 2 % for γ = 0.98
 JUDGED = 5  # episodes of each learner after an update
 JUDGING_SEED = 77
+SIDE_BY_SIDE = 5  # learners of one program
+Errors = dict[str, Float[np.ndarray, "updates L"]]
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ class Options:
     num_envs: int = 5  # environments of each learner
     frames: int = 12_000  # environment steps per learner
     seed: int = 0  # of environments and policies
+    out: Path = Path("runs/action-values")  # where the errors of every update go
     results: Path = Path("experiments/results")  # where the figures go
 
 
@@ -83,44 +87,47 @@ class Classroom:
 
 
 def main(options: Options) -> None:
-    """Run, print, write."""
+    """Run what has not run, print, write."""
     torch.set_num_threads(1)
-    errors = run(options)
-    updates = len(errors[ANEW])
-    figures = {}
-    for name, error in errors.items():
-        late = error[updates // 2 :].mean(0)
-        less = errors[ANEW][updates // 2 :].mean(0) - late
-        figures[name] = {"error": interval(late), "below estimated anew": interval(less)}
-        print(
-            name.ljust(40), *(f"{a:.2f} [{b:.2f}, {c:.2f}]" for a, b, c in figures[name].values()), sep="  "
-        )
+    guide = "anew" if options.driver == ANEW else "other"
+    name = f"{options.task.replace('-', '_')}_{guide}"
+    pieces = [recorded(name, first, options) for first in range(0, options.learners, SIDE_BY_SIDE)]
+    errors = {way: np.concatenate([piece[way] for piece in pieces], 1) for way in WAYS}
+    late = {way: error[len(error) // 2 :].mean(0) for way, error in errors.items()}
+    figures = {
+        way: {"error": interval(error), "below estimated anew": interval(late[ANEW] - error)}
+        for way, error in late.items()
+    }
+    for way, figure in figures.items():
+        print(way.ljust(40), *(f"{a:.2f} [{b:.2f}, {c:.2f}]" for a, b, c in figure.values()), sep="  ")
     made = {"driver": options.driver, "learners": options.learners, "frames": options.frames, **figures}
     options.results.mkdir(parents=True, exist_ok=True)
-    guide = "anew" if options.driver == ANEW else "other"
-    path = options.results / f"action_values_{options.task.replace('-', '_')}_{guide}.json"
+    path = options.results / f"action_values_{name}.json"
     path.write_text(json.dumps(made, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def run(options: Options) -> dict[str, Float[np.ndarray, "updates L"]]:
+def recorded(name: str, first: int, options: Options) -> Errors:
+    """Errors of a few learners, from an earlier call if there was one."""
+    path = options.out / f"{name}-{options.frames}-{first}.json"
+    if not path.exists():
+        errors = run(first, min(SIDE_BY_SIDE, options.learners - first), options)
+        options.out.mkdir(parents=True, exist_ok=True)
+        lists = {way: error.tolist() for way, error in errors.items()}
+        path.write_text(json.dumps(lists, ensure_ascii=False) + "\n", encoding="utf-8")
+    return {way: np.array(lists) for way, lists in json.loads(path.read_text(encoding="utf-8")).items()}
+
+
+def run(first: int, learners: int, options: Options) -> Errors:
     """Errors of every process right after every update of the policy."""
-    env = envs.make(
-        options.task, learners=options.learners, num_envs=options.num_envs, seed=options.seed, threads=1
-    )
+    common: dict[str, Any] = {"learners": learners, "first_learner": first, "threads": 1}
+    env = envs.make(options.task, num_envs=options.num_envs, seed=options.seed, **common)
     plain = PolicyGradientConfig(total_frames=options.frames)
     ways = {name: dataclasses.replace(plain, **numbers) for name, numbers in WAYS.items()}
-    learner = PolicyGradient(env, ways.pop(options.driver), seed=options.seed)
+    learner = PolicyGradient(env, ways.pop(options.driver), seed=options.seed, first_learner=first)
     classroom = Classroom(learner, ways)
     critics = {options.driver: classroom.own.critic}
     critics |= {name: teacher.critic for name, teacher in classroom.others.items()}
-    judging = envs.make(
-        options.task,
-        learners=options.learners,
-        num_envs=JUDGED,
-        seed=JUDGING_SEED,
-        threads=1,
-        horizon=STEPS + TAIL + 1,
-    )
+    judging = envs.make(options.task, num_envs=JUDGED, seed=JUDGING_SEED, horizon=STEPS + TAIL + 1, **common)
     errors: dict[str, list[Tensor]] = {name: [] for name in WAYS}
     for _ in learner.train():
         episodes = played(judging, learner)

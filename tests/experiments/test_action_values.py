@@ -1,12 +1,14 @@
 """Processes side by side: what is taught alike knows alike, and nobody disturbs the one that guides."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
 
 import envs
 from experiments import action_values
-from experiments.action_values import ANEW, REMEMBERS, Options, error, played, run
+from experiments.action_values import ANEW, REMEMBERS, Options, error, main, played
 from torch_gprl.learners import PolicyGradient, PolicyGradientConfig
 
 SMALL = {"rollout_steps": 20, "targets": "differences", "budget": 15, "renew_every": 1}
@@ -18,13 +20,23 @@ def short(monkeypatch):
     monkeypatch.setattr(action_values, "TAIL", 5)
 
 
-def test_processes_that_are_taught_alike_know_alike_and_others_do_not(monkeypatch):
+def test_processes_that_are_taught_alike_know_alike_and_others_do_not(tmp_path, monkeypatch):
     ways = {ANEW: SMALL, "the same": SMALL, REMEMBERS: SMALL | {"replay": 100, "noise": 0.1}}
     monkeypatch.setattr(action_values, "WAYS", ways)
-    errors = run(Options(task="pendulum-balance", learners=2, num_envs=2, frames=120))
+    monkeypatch.setattr(action_values, "SIDE_BY_SIDE", 1)
+    folders = {"out": tmp_path / "out", "results": tmp_path / "results"}
+    main(Options(task="pendulum-balance", learners=2, num_envs=2, frames=120, **folders))
+    pieces = [json.loads(path.read_text()) for path in sorted(folders["out"].iterdir())]
+    errors = {way: np.concatenate([piece[way] for piece in pieces], 1) for way in ways}
     assert errors[ANEW].shape == (3, 2)
+    assert (errors[ANEW][:, 0] != errors[ANEW][:, 1]).all()  # learners of two programs differ
     np.testing.assert_array_equal(errors["the same"], errors[ANEW])
     assert (errors[REMEMBERS] != errors[ANEW]).all()
+    (result,) = folders["results"].iterdir()
+    figures = json.loads(result.read_text())
+    assert figures["the same"]["below estimated anew"] == [0.0, 0.0, 0.0]
+    below = errors[ANEW][1:].mean() - errors[REMEMBERS][1:].mean()
+    assert figures[REMEMBERS]["below estimated anew"][0] == pytest.approx(below)
 
 
 def test_the_error_of_an_empty_process_is_the_root_mean_square_return():

@@ -13,7 +13,7 @@ def statistics(stamps: torch.Tensor, used: int | None = None) -> BasisStatistics
     size = stamps.shape[-1]
     alpha, inverse, precision = (torch.rand(stamps.shape, dtype=torch.float64) + 0.1 for _ in range(3))
     mask = torch.arange(size).expand(stamps.shape) < (size if used is None else used)
-    return BasisStatistics(alpha, inverse, precision, stamps, mask)
+    return BasisStatistics(alpha, inverse, lambda: precision, stamps, mask)
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -11,12 +11,14 @@ deletion in whitened coordinates, where the basis values are u = L w and the pos
 | Q_ii + C_ii | `posterior_precision_diagonal` | diagonal of L⁻ᵀA⁻¹L⁻¹ |
 """
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torch_gprl.gp.whitened import solve_triangular, squared_columns
 from torch_gprl.linalg import cholesky
 
 
@@ -25,7 +27,7 @@ class BasisStatistics(NamedTuple):
 
     alpha: Float[Tensor, "*batch B"]
     gram_inverse_diagonal: Float[Tensor, "*batch B"]
-    posterior_precision_diagonal: Float[Tensor, "*batch B"]
+    posterior_precision_diagonal: Callable[[], Float[Tensor, "*batch B"]]  # few scores ask, and it costs
     stamps: Int[Tensor, "*batch B"]
     mask: Bool[Tensor, "*batch B"]
 
@@ -43,15 +45,15 @@ def basis_statistics(
 ) -> BasisStatistics:
     """What a score sees of a basis, [*batch, B] each."""
     eye = torch.eye(stamps.shape[-1], dtype=state.precision.dtype, device=stamps.device)
-    inverse_factor = torch.linalg.solve_triangular(
-        state.gram_factor, eye.expand_as(state.gram_factor), upper=False
-    )
+    inverse_factor = solve_triangular(state.gram_factor.contiguous(), eye.expand_as(state.gram_factor))
     precision_factor = cholesky(state.precision)
-    half = torch.linalg.solve_triangular(precision_factor, inverse_factor, upper=False)
     weights = torch.cholesky_solve(state.information.unsqueeze(-1), precision_factor)
     alpha = (inverse_factor.mT @ weights).squeeze(-1)  # L⁻ᵀA⁻¹b
-    gram_inverse, posterior_precision = (torch.linalg.vecdot(x, x, dim=-2) for x in (inverse_factor, half))
-    return BasisStatistics(alpha, gram_inverse, posterior_precision, stamps, mask)
+
+    def posterior_precision_diagonal() -> Tensor:
+        return squared_columns(solve_triangular(precision_factor, inverse_factor))
+
+    return BasisStatistics(alpha, squared_columns(inverse_factor), posterior_precision_diagonal, stamps, mask)
 
 
 @runtime_checkable
@@ -80,7 +82,7 @@ class InformationScore:
         """Score each basis vector [*batch, B]."""
         if self.kind == "mean":
             return (statistics.alpha / statistics.gram_inverse_diagonal).square()
-        return statistics.alpha.square() / statistics.posterior_precision_diagonal
+        return statistics.alpha.square() / statistics.posterior_precision_diagonal()
 
     def __repr__(self) -> str:
         return f"InformationScore({self.kind!r})"
@@ -170,10 +172,10 @@ def keep_first(
     # Schur complement: A_kk − A_kd A_dd⁻¹ A_dk, b_k − A_kd A_dd⁻¹ b_d
     gone_factor = cholesky(precision[..., kept:, kept:])
     right = torch.cat([precision[..., kept:, :kept], information[..., kept:, None]], -1)
-    half = torch.linalg.solve_triangular(gone_factor, right, upper=False)
+    half = solve_triangular(gone_factor, right)
     half_cross, half_information = half[..., :-1], half[..., -1:]
     left = left - half_cross.mT @ half_cross
-    left = 0.5 * (left + left.mT)
+    left = (left + left.mT).mul_(0.5)
     left_information = left_information - (half_cross.mT @ half_information).squeeze(-1)
     log_determinant = 2 * gone_factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     evidence = 0.5 * (half_information.square().sum((-2, -1)) - log_determinant)

@@ -1,5 +1,6 @@
 """Kernels of action values by name: what they are, and the graphs that grow under them."""
 
+from copy import deepcopy
 from typing import get_args
 
 import pytest
@@ -18,7 +19,7 @@ from torch_gprl.critics import (
     store_transitions,
     suit_graphs,
 )
-from torch_gprl.gp import SparseOnlineGP
+from torch_gprl.gp import SparseOnlineGP, fit_hyperparameters
 from torch_gprl.graphs import Experience, TransitionGraph
 from torch_gprl.kernels import GaussianInputs, Matern, SquaredExponential, SuccessorWithRest
 from torch_gprl.policies import GaussianPolicy, LinearController, gaussian_policy
@@ -194,8 +195,12 @@ def test_a_graph_of_states_and_actions_takes_its_parameters_from_a_squared_expon
     store_transitions(critic, data, acting())
     x = critic.inputs(data["observation"], data["action"])
     values = (3 * x[..., 0]).sin() + 0.01 * torch.randn(x.shape[:-1], dtype=torch.float64)
-    assert suit_graphs(critic, x, values, 30)
     kernel = critic.gp.kernel
     assert isinstance(kernel, SuccessorWithRest)
+    ordinary = SparseOnlineGP(deepcopy(kernel.rest).requires_grad_(True), 1, 0.05)
+    fit_hyperparameters(ordinary, x, values, 30)
+    assert suit_graphs(critic, x, values, 30)
+    torch.testing.assert_close(critic.gp.noise_variance, 4 * ordinary.noise_variance)
+    torch.testing.assert_close(kernel.rest.lengthscale, ordinary.kernel.lengthscale)
     assert (kernel.rest.lengthscale[:, 0] < 0.5 * kernel.rest.lengthscale[:, 2]).all()
     torch.testing.assert_close(kernel.told.outputscale, 2 * kernel.rest.outputscale)

@@ -109,8 +109,8 @@ def _add_most_novel(
         novelty[pivot] = 0.0  # nothing is missed of a basis vector
         pivots.append(pivot)
         rows += 1
-    known = torch.from_numpy(features)[:, :rows]
-    _append(gp, before, known[pivots].tril_(before), _only(inputs, 2)[pivots])
+    known, picked = torch.from_numpy(features)[:, :rows], torch.tensor(pivots)
+    _append(gp, before, known[picked].tril_(before), _only(inputs, 2)[picked])
     return known.mT
 
 

@@ -59,19 +59,18 @@ class GaussianBumps:
 
     def __init__(self, z: OtherInputs, log_lengthscale: Tensor, log_outputscale: Tensor) -> None:
         with torch.no_grad():
-            weight = log_lengthscale.mul(-2).exp_()  # ℓ⁻²
-            self.centre = z[..., :1, :].to(weight.dtype)
+            self.weight = log_lengthscale.mul(-2).exp_().unsqueeze(-1)  # ℓ⁻²
+            self.centre = z[..., :1, :].to(self.weight.dtype)
             points = z - self.centre
-            self.half_weight = weight.mul(0.5).unsqueeze(-1)
-            half_square = (points.square() @ self.half_weight).mT
-            self.columns = (points * weight.unsqueeze(-2)).mT  # z/ℓ²
-            self.peak = log_outputscale[..., None, None] - half_square  # log σ² − ½|z|²/ℓ²
+            square = (points.square() @ self.weight).mT
+            self.columns = points.mT * self.weight  # z/ℓ²
+            self.peak = torch.sub(log_outputscale[..., None, None], square, alpha=0.5)  # log σ² − ½|z|²/ℓ²
         self._arrays: tuple[np.ndarray, ...] | None = None
 
     def __call__(self, x: Inputs) -> Float[Tensor, "... M N"]:
         """Covariances with x [*batch, N, D]."""
         x = x.to(self.peak.dtype) - self.centre
-        exponent = self.peak - x.square() @ self.half_weight
+        exponent = torch.sub(self.peak, x.square() @ self.weight, alpha=0.5)
         if x.ndim == self.columns.ndim == 2:
             exponent.addmm_(x, self.columns)
         elif x.ndim == 3 and x.shape[:-2] == self.columns.shape[:-2]:
@@ -84,13 +83,13 @@ class GaussianBumps:
         """Covariances [M] with one point x [D], for a batch of one on the CPU: NumPy's calls cost less."""
         if self._arrays is None:
             points = self.columns.mT.reshape(-1, len(x))
-            others = (self.peak, self.centre, self.half_weight)
+            others = (self.peak, self.centre, self.weight)
             self._arrays = points.numpy(), *(other.numpy().reshape(-1) for other in others)
-        points, peak, centre, half_weight = self._arrays
+        points, peak, centre, weight = self._arrays
         x = x - centre
         exponent = points.dot(x)
         exponent += peak
-        exponent -= half_weight.dot(x * x)
+        exponent -= 0.5 * weight.dot(x * x)
         return np.exp(exponent, out=exponent)
 
 

@@ -35,10 +35,15 @@ from torch_gprl.policies import GaussianPolicy
 from torch_gprl.runs import bootstrap_interval
 
 ANEW = "estimated anew"
-REMEMBERS = "all experience kept, solved anew"
-NAMES = (ANEW, "kept, λ = 0.0", "kept, λ = 0.5", "kept, λ = 1.0", "newest rollout alone, solved at once")
-WAYS: dict[str, dict[str, Any]] = {name: CLAIM_2[name] for name in NAMES} | {
-    REMEMBERS: PERSISTENT | AT_ONCE | {"replay": 12_000, "solved": 4_000}
+SOLVED = PERSISTENT | AT_ONCE | {"budget": 300, "noise": 0.5, "solved": 4_000}
+WAYS: dict[str, dict[str, Any]] = {
+    ANEW: CLAIM_2[ANEW],
+    "kept, λ = 0.0": CLAIM_2["kept, λ = 0.0"],
+    "kept, λ = 1.0": CLAIM_2["kept, λ = 1.0"],
+    "newest rollout alone, solved at once": SOLVED | {"replay": 1_000},
+    "two rollouts kept, solved anew": SOLVED | {"replay": 2_000},
+    "four rollouts kept, solved anew": SOLVED | {"replay": 4_000},
+    "all experience kept, solved anew": SOLVED | {"replay": 12_000},
 }
 STEPS, TAIL = 200, 200  # of a judged episode, and behind it: γ^200 is 2 % for γ = 0.98
 JUDGED = 5  # episodes of each learner after an update
@@ -53,6 +58,7 @@ class Options:
 
     task: str = "pendulum-swingup"  # id of the task
     driver: str = ANEW  # the process that guides the policy, one of WAYS
+    first: int = 0  # index of the first learner; the numbers of WAYS were chosen on learners 0 to 3
     learners: int = 20  # independent learners
     num_envs: int = 5  # environments of each learner
     frames: int = 12_000  # environment steps per learner
@@ -91,7 +97,8 @@ def main(options: Options) -> None:
     torch.set_num_threads(1)
     guide = "anew" if options.driver == ANEW else "other"
     name = f"{options.task.replace('-', '_')}_{guide}"
-    pieces = [recorded(name, first, options) for first in range(0, options.learners, SIDE_BY_SIDE)]
+    last = options.first + options.learners
+    pieces = [recorded(name, first, options) for first in range(options.first, last, SIDE_BY_SIDE)]
     errors = {way: np.concatenate([piece[way] for piece in pieces], 1) for way in WAYS}
     late = {way: error[len(error) // 2 :].mean(0) for way, error in errors.items()}
     figures = {
@@ -100,7 +107,8 @@ def main(options: Options) -> None:
     }
     for way, figure in figures.items():
         print(way.ljust(40), *(f"{a:.2f} [{b:.2f}, {c:.2f}]" for a, b, c in figure.values()), sep="  ")
-    made = {"driver": options.driver, "learners": options.learners, "frames": options.frames, **figures}
+    learners = [options.first, last - 1]
+    made = {"driver": options.driver, "learners": learners, "frames": options.frames, **figures}
     options.results.mkdir(parents=True, exist_ok=True)
     path = options.results / f"action_values_{name}.json"
     path.write_text(json.dumps(made, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -110,7 +118,7 @@ def recorded(name: str, first: int, options: Options) -> Errors:
     """Errors of a few learners, from an earlier call if there was one."""
     path = options.out / f"{name}-{options.frames}-{first}.json"
     if not path.exists():
-        errors = run(first, min(SIDE_BY_SIDE, options.learners - first), options)
+        errors = run(first, min(SIDE_BY_SIDE, options.first + options.learners - first), options)
         options.out.mkdir(parents=True, exist_ok=True)
         lists = {way: error.tolist() for way, error in errors.items()}
         path.write_text(json.dumps(lists, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -8,9 +8,10 @@ import torch
 
 import envs
 from experiments import action_values
-from experiments.action_values import ANEW, REMEMBERS, Options, error, main, played
+from experiments.action_values import ANEW, Options, error, main, played
 from torch_gprl.learners import PolicyGradient, PolicyGradientConfig
 
+REMEMBERED = "all experience kept, solved anew"
 SMALL = {"rollout_steps": 20, "targets": "differences", "budget": 15, "renew_every": 1}
 
 
@@ -21,7 +22,7 @@ def short(monkeypatch):
 
 
 def test_processes_that_are_taught_alike_know_alike_and_others_do_not(tmp_path, monkeypatch):
-    ways = {ANEW: SMALL, "the same": SMALL, REMEMBERS: SMALL | {"replay": 100, "noise": 0.1}}
+    ways = {ANEW: SMALL, "the same": SMALL, REMEMBERED: SMALL | {"replay": 100, "noise": 0.1}}
     monkeypatch.setattr(action_values, "WAYS", ways)
     monkeypatch.setattr(action_values, "SIDE_BY_SIDE", 1)
     folders = {"out": tmp_path / "out", "results": tmp_path / "results"}
@@ -31,12 +32,12 @@ def test_processes_that_are_taught_alike_know_alike_and_others_do_not(tmp_path, 
     assert errors[ANEW].shape == (3, 2)
     assert (errors[ANEW][:, 0] != errors[ANEW][:, 1]).all()  # learners of two programs differ
     np.testing.assert_array_equal(errors["the same"], errors[ANEW])
-    assert (errors[REMEMBERS] != errors[ANEW]).all()
+    assert (errors[REMEMBERED] != errors[ANEW]).all()
     (result,) = folders["results"].iterdir()
     figures = json.loads(result.read_text())
     assert figures["the same"]["below estimated anew"] == [0.0, 0.0, 0.0]
-    below = errors[ANEW][1:].mean() - errors[REMEMBERS][1:].mean()
-    assert figures[REMEMBERS]["below estimated anew"][0] == pytest.approx(below)
+    below = errors[ANEW][1:].mean() - errors[REMEMBERED][1:].mean()
+    assert figures[REMEMBERED]["below estimated anew"][0] == pytest.approx(below)
 
 
 def test_the_error_of_an_empty_process_is_the_root_mean_square_return():

@@ -27,7 +27,6 @@ from torch_gprl.kernels import (
     SquaredExponential,
     SuccessorWithRest,
 )
-from torch_gprl.kernels.graph_values import TEMPER
 
 BLOCK = 250  # points of one update
 MOST_NODES = 300  # of a graph of basis vectors: a budget with its overshoot
@@ -124,7 +123,7 @@ class Tuned:
         ordinary = Matern(dims, smoothness=0.5)
         if isinstance(self.kernel, SuccessorWithRest):
             grow(self.graph, seen, torch.ones_like(kept))
-            self.noise = TEMPER * fit(ordinary)
+            self.noise = fit(ordinary)
             self.kernel.suit(ordinary.lengthscale, ordinary.outputscale)
         elif isinstance(self.graph, Experience):
             grow(self.graph, seen, kept)

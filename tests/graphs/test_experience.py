@@ -203,21 +203,19 @@ def test_learners_pull_back_apart_and_nothing_seen_changes_nothing():
         torch.testing.assert_close(alone.pulled_back(lengthscale, 0.9), found[learner])
 
 
-def test_half_samples_share_whole_trajectories_out_evenly_and_are_never_empty():
-    experience = Experience(2, 80, 10)
-    experience.add(*trajectories(8, 8))
-    halves = torch.stack(experience.half_samples(6))
-    of_trajectory = halves[:, :64].unflatten(-1, (8, 8))
-    assert (of_trajectory == of_trajectory[..., :1]).all()
-    assert not halves[:, 64:].any()
-    first, second = halves[::2, :64].double(), halves[1::2, :64].double()
-    assert (first + second == 1).all()
-    # every half shares a quarter of the trajectories with each half of every other way to halve them
-    shared = first @ first.mT
-    torch.testing.assert_close(shared, 16.0 * (torch.ones_like(shared) + torch.eye(3)))
+def test_folds_leave_whole_trajectories_out_in_different_ways_and_never_all():
+    experience = Experience(2, 120, 10)
+    experience.add(*trajectories(9, 12))
+    number = torch.arange(120) // 12
+    for way in range(2):
+        for fold, kept in enumerate(experience.without_folds(3, way)):
+            assert torch.equal(kept, experience.mask & (number // 3**way % 3 != fold))
+    lacking = [~torch.stack(experience.without_folds(3, way))[:, :108] for way in range(2)]
+    shared = lacking[0].double() @ lacking[1].double().mT
+    torch.testing.assert_close(shared, torch.full_like(shared, 12))  # one trajectory
     alone = Experience(2, 80, 10)
     alone.add(*trajectories(1, 12))
-    assert all(torch.equal(kept, alone.mask) for kept in alone.half_samples(6))
+    assert all(torch.equal(kept, alone.mask) for kept in alone.without_folds(3, 1))
 
 
 def test_a_trajectory_of_states_and_actions_goes_on_though_another_action_was_taken():
@@ -225,4 +223,4 @@ def test_a_trajectory_of_states_and_actions_goes_on_though_another_action_was_ta
     actions, next_actions = torch.randn(2, 48, 1, dtype=torch.float64)
     experience = Experience(3, 80, 10)
     experience.add(torch.cat([states, actions], -1), torch.cat([next_states, next_actions], -1))
-    assert torch.equal(experience.half_samples(2)[1], experience.mask & (torch.arange(80) // 12 % 2 == 1))
+    assert torch.equal(experience.without_folds(2)[0], experience.mask & (torch.arange(80) // 12 % 2 == 1))

@@ -10,7 +10,6 @@ The graph of a kernel belongs to it, and so to what is saved and moved with the 
 the inputs anew, and `suit_graphs` when it fits hyper-parameters.
 """
 
-import math
 from collections.abc import Iterator
 from copy import deepcopy
 from typing import Literal
@@ -35,7 +34,6 @@ from torch_gprl.kernels import (
     SquaredExponential,
     SuccessorWithRest,
 )
-from torch_gprl.kernels.graph_values import TEMPER
 
 KernelName = Literal[
     "squared-exponential",
@@ -220,7 +218,7 @@ def suit_graphs(
         fit_hyperparameters(process, inputs, targets, steps)
         successor.suit(of_values.lengthscale, of_values.outputscale)
         with torch.no_grad():
-            critic.gp.log_noise_variance.copy_(process.log_noise_variance + math.log(TEMPER))
+            critic.gp.log_noise_variance.copy_(process.log_noise_variance)
         critic.gp.rebase()
         return True
     return False

@@ -178,17 +178,22 @@ class Experience(nn.Module):
         # some twice if there are too few
         self.landmarks.copy_(chosen[..., torch.arange(self.landmarks.shape[-1]) % chosen.shape[-1]])
 
-    def half_samples(self, count: int) -> list[Bool[Tensor, "*batch C"]]:
-        """Halves of the trajectories, two of each of count / 2 ways to halve them (McCarthy, 1969).
+    def without_folds(self, count: int, way: int = 0) -> list[Bool[Tensor, "*batch C"]]:
+        """All transitions but those of one fold of the trajectories, for each of `count` folds.
 
-        Member 2j + s has the trajectories whose number has s as its binary digit j, so that any two ways are
-        as different as can be. Where nothing is left, all transitions. A trajectory goes on where half of the
-        columns of a row are those that the row before it arrives at: a graph of states and actions stores the
-        policy's action there, not the one that was taken.
+        Where nothing else is left, all transitions. A trajectory goes on where half of the columns of a row
+        are those that the row before it arrives at: a graph of states and actions stores the policy's action
+        there, not the one that was taken.
+
+        Args:
+            count: folds.
+            way: to divide into folds, by this digit of the trajectories' numbers to the base `count`; so any
+                two folds of different ways have as little as can be in common.
         """
         same = self.next_states[..., :-1, :] == self.states[..., 1:, :]
         number = nn.functional.pad((same.double().mean(-1) < 0.5).cumsum(-1), (1, 0))
-        kept = [self.mask & ((number >> member // 2) % 2 == member % 2) for member in range(count)]
+        digit = number // count**way % count
+        kept = [self.mask & (digit != fold) for fold in range(count)]
         return [torch.where(some.any(-1, keepdim=True), some, self.mask) for some in kept]
 
     def nearest(

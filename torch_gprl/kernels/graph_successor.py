@@ -8,7 +8,7 @@ representation; as a prior of values it is that of Engel et al. (2005) with the 
 Inputs off the graph are followed ahead: x, its expected successor, and so on, for some steps before the last
 one borrows from the vertices near it. That is what finds the side of a ridge on which an input lies. It is a
 hard decision, which one trajectory more or less may turn round. So a committee takes it, each member of which
-knows half of the trajectories (Bühlmann and Yu, 2002) and looks ahead for a time of its own. Where its
+lacks a fold of the trajectories (Parmanto, Munro and Doyle, 1996) and looks ahead another time. Where its
 members, or the vertices that they end at, disagree, the variance that the average loses is kept, and so is a
 part of that of the vertices nearest to the input itself: near a ridge the prior stays wide. So it does for
 inputs that lie far from all vertices. Inputs on the graph went where they went.
@@ -19,7 +19,6 @@ inputs that lie far from all vertices. Inputs on the graph went where they went.
 | Mφ | `vertices` | expected discounted sum of φ from each visited state on |
 """
 
-import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -40,8 +39,8 @@ from torch_gprl.linalg import cholesky
 from torch_gprl.typing import CrossMatrix, Inputs, OtherInputs, PerPoint
 
 FIRST_DOUBT = 0.1  # until it is set or fitted
-MEMBERS = 6  # of the committee
-AHEAD = (0.5, 1.0, 2.0)  # how far they follow in turn, in parts of the lookahead
+AHEAD = (0.5, 1.0, 2.0)  # how far members of the committee follow, in parts of the lookahead
+WAYS = 2  # to divide the trajectories into folds, each of which one member lacks
 
 
 class Way(NamedTuple):
@@ -200,10 +199,11 @@ class SuccessorKernel(TableKernel):
 
     def _follow(self, x: Tensor) -> list[Way]:
         """The way from x by each member of the committee."""
-        halves = self.experience.half_samples(MEMBERS)
+        folds = len(AHEAD)
         return [
-            self._follow_among(x, known, int(part * self.lookahead))
-            for known, part in zip(halves, itertools.cycle(AHEAD), strict=False)
+            self._follow_among(x, known, int(AHEAD[(fold + way) % folds] * self.lookahead))
+            for way in range(WAYS)
+            for fold, known in enumerate(self.experience.without_folds(folds, way))
         ]
 
     def _follow_among(self, x: Tensor, known: Tensor, steps: int) -> Way:

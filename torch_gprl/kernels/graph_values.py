@@ -1,12 +1,10 @@
 """A prior of values from experience, with an ordinary one for what experience cannot tell.
 
 All parameters come from an ordinary kernel fitted to values, a matter of milliseconds: its length scales for
-the graph and for the rest, and its variance, whole for the graph and half for the rest; far from all visited
-states the other half is added. The marginal likelihood of the sum itself misleads. Points of one trajectory
-tell each other nearly all through the graph, so that hardly any variance is left for the rest, and states
-that no trajectory passed are then predicted with far too much confidence. The noise is more than that
-kernel's: where the graph errs, it errs along whole trajectories, whose targets count for less than so many
-independent ones (a tempered likelihood: Grünwald and van Ommen, 2017).
+the graph and for the rest, and its variance, whole for the graph and a quarter for the rest; inputs far from
+all experience get the other three. The marginal likelihood of the sum itself misleads. Points of one
+trajectory tell each other nearly all through the graph, so that hardly any variance is left for the rest, and
+states that no trajectory passed are then predicted with far too much confidence.
 """
 
 from jaxtyping import Float
@@ -20,8 +18,7 @@ from torch_gprl.kernels.parameters import PositiveValue
 from torch_gprl.kernels.stationary import Matern, Stationary
 
 REWARDS = 2.0  # length scales of rewards, in those of values, which are rougher
-REST = 0.5  # of the variance of values
-TEMPER = 4.0  # of the noise variance that an ordinary kernel finds
+REST = 0.25  # of the variance of values
 
 
 class SuccessorWithRest(Sum):
@@ -77,13 +74,12 @@ class SuccessorWithRest(Sum):
     ) -> None:
         """Take length scales, the units of the graph and both variances from an ordinary kernel of values.
 
-        See `Experience.pulled_back`. What a process has learned needs `rebase` afterwards, and `TEMPER` times
-        the noise variance that was fitted with that kernel.
+        See `Experience.pulled_back`. What a process has learned needs `rebase` afterwards.
 
         Args:
             lengthscale: of a kernel like the rest, fitted to values [*batch, D], in units of the inputs.
-            outputscale: its prior variance [*batch], given to what experience tells, and half of it to the
-                rest; the other half to inputs far from all experience.
+            outputscale: its prior variance [*batch], given to what experience tells, and a quarter of it to
+                the rest; inputs far from all experience get the other three.
         """
         experience = self.told.experience
         experience.measure(experience.pulled_back(lengthscale.detach(), self.told.discount))

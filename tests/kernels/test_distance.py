@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from torch_gprl.kernels import SquaredExponential
 from torch_gprl.kernels.distance import DIRECT_SIZE, log_gaussian
 
 
@@ -43,3 +44,19 @@ def test_the_gradient_of_the_exact_diagonal_is_that_of_the_output_scale():
     by_point, by_height = torch.autograd.grad(diagonal, [x, height])
     assert not by_point.any()
     assert by_height == 4.0
+
+
+@pytest.mark.parametrize(
+    ("learners", "basis", "inputs"),
+    [((), (), ()), ((3,), (3,), (3,)), ((), (2, 3), (2, 3)), ((3,), (3,), ())],
+)
+def test_a_prepared_kernel_is_the_kernel_with_both_derivatives(
+    learners: tuple[int, ...], basis: tuple[int, ...], inputs: tuple[int, ...]
+):
+    kernel = SquaredExponential(2, 0.7, 1.3, learners).requires_grad_(False)
+    z = torch.randn(*basis, 5, 2, dtype=torch.float64)
+    x = torch.randn(*inputs, 3, 2, dtype=torch.float64, requires_grad=True)
+    prepared = kernel.against(z)
+    torch.testing.assert_close(prepared(x), kernel(x, z).mT)
+    assert torch.autograd.gradcheck(prepared, x)
+    assert torch.autograd.gradgradcheck(prepared, x)

@@ -1,7 +1,7 @@
 """A policy that explores by its newest parameters and acts without exploration by a mean of its recent ones.
 
 Polyak and Juditsky (1992), "Acceleration of stochastic approximation by averaging". Steps of a fixed length
-leap to and fro across an optimum; their mean lies nearer to it, and a single bad step hardly moves it.
+leap back and forth across an optimum; their mean is nearer to it, and a single bad step hardly moves it.
 """
 
 # tensordict wraps the methods of its modules in decorators that hide their signatures:

@@ -163,3 +163,13 @@ def test_far_from_the_origin_nothing_is_lost():
     for here, there, dense in zip(near.posterior(CENTRES), far.posterior(CENTRES + 1e4), exact, strict=True):
         torch.testing.assert_close(here, there, rtol=1e-6, atol=1e-6)
         torch.testing.assert_close(here, dense, rtol=1e-2, atol=1e-2)
+
+
+def test_where_covariances_underflow_mean_and_variance_have_no_slope_and_no_curvature():
+    gp = sparse()
+    gp.update(*near_duplicates(100))
+    far = torch.full((1, 2), 1e3, dtype=torch.float64)
+    assert tuple(map(float, gp.posterior(far))) == (0.0, float(gp.kernel.diag(far)))
+    for part in (0, 1):
+        hessian = torch.autograd.functional.hessian(lambda x, part=part: gp.posterior(x)[part].sum(), far)
+        assert torch.equal(hessian, torch.zeros_like(hessian))

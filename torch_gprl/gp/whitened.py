@@ -361,8 +361,10 @@ def solve_triangular(factor: Tensor, right: Tensor, upper: bool = False) -> Tens
 
 
 def squared_columns(matrix: Tensor) -> Tensor:
-    """Squared norm of each column [*batch, N], without a copy of the matrix, unlike the sum of a product."""
-    return torch.linalg.vector_norm(matrix, dim=-2).square()
+    """Squared norm of each column [*batch, N]."""
+    if matrix.requires_grad:  # the norm of a column of zeros has no second derivative
+        return torch.linalg.vecdot(matrix, matrix, dim=-2)
+    return torch.linalg.vector_norm(matrix, dim=-2).square()  # makes no copy of the matrix
 
 
 def _solve(gram_factor: Tensor, precision: Tensor, information: Tensor) -> Solved:

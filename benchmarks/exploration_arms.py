@@ -130,11 +130,11 @@ BY_VALUES = {
 
 
 def _by_plans(task: str, frames: int, every: int, **numbers: float) -> Setting:
-    """The same task for dynamic programming, which needs fewer steps, and here plans half as often."""
+    """The same task for dynamic programming, which needs fewer steps; what it plans is judged as it is."""
     return dataclasses.replace(
         BY_VALUES[task],
         learner="dynamic-programming",
-        numbers={"growth": 0.1} | numbers,
+        numbers={"growth": 0.1, "look_ahead": 0} | numbers,
         frames=frames,
         every=every,
     )

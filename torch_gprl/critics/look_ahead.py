@@ -92,8 +92,8 @@ class LookAhead:
     ) -> Float[Tensor, "L N H A"]:
         """The best of a course, its variations [K, H, A], and the policy's course."""
         varied = (course.unsqueeze(2) + variations.to(course)).clamp(-1, 1)
-        known = torch.stack([course, self.followed(states)], 2)
-        courses = torch.cat([varied, known], 2)
+        known = torch.stack([self.followed(states), course], 2)
+        courses = torch.cat([known, varied], 2)  # of courses that earn alike the first is taken
         best = self.earned(states, courses).argmax(-1)
         return courses.take_along_dim(best[..., None, None, None], 2).squeeze(2)
 

@@ -27,7 +27,7 @@ class Planning:
     smoothness: float = 0.5  # of values, as in Matérn kernels: 0.5, 1.5 or 2.5
     rehearsal: int = 60  # steps of the imagined walks that improve what is performed; 0: perform the plan
     ascents: int = 12  # gradient steps of a rehearsal
-    look_ahead: int = 0  # steps of the courses compared before acting; 0: do not look ahead
+    look_ahead: int = 20  # steps of the courses compared before acting; 0: do not look ahead
     variations: int = 48  # of the last course, in each comparison
 
 

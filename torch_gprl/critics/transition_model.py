@@ -1,9 +1,12 @@
-"""What a step leads to, learned: next observation and reward as Gaussian processes of observation and action.
+"""What a step leads to, learned: next observation and reward as Gaussian processes.
+
+    ŝ' = s + f(s, a),   r̂ = ρ(ŝ', a)
 
 Differences of observations, and rewards, have as their prior a squared exponential for the bends plus a
 linear kernel for what mechanics makes of small steps (Deisenroth, Fox and Rasmussen, 2015, learn the same
-differences). Inputs and targets are standardised by the data. Rewards are those of steps that go on; what
-ends pay is learned in `ends`.
+differences). The reward is learned as a function of where the step leads: rewards for places then depend on
+places alone, which the fit finds out, and noise on the way does not blur them. Inputs and targets are
+standardised by the data. Rewards are those of steps that go on; what ends pay is learned in `ends`.
 """
 
 import math
@@ -20,7 +23,7 @@ from torch_gprl.kernels import Kernel, Linear, SquaredExponential
 from torch_gprl.linalg import CholeskyError, cholesky
 
 FIRST_NOISE, NOISE_FLOOR = 1e-3, 1e-5  # variances, of standardised targets
-FIT_POINTS, FIT_STEPS = 100, 40  # data and optimiser steps of a fit of hyper-parameters
+FIT_RATE = 0.1  # of Adam, in log hyper-parameters
 MARGIN = 0.1  # predictions stay in the range of what was seen, widened by this share on either side
 
 
@@ -56,6 +59,24 @@ class Prediction(NamedTuple):
     doubt: Tensor
 
 
+class Fit(NamedTuple):
+    """How hyper-parameters are fitted.
+
+    Attributes:
+        points: data at most.
+        steps: of the optimiser.
+        lengthscale: to begin with, in standard deviations of the inputs.
+    """
+
+    points: int
+    steps: int
+    lengthscale: float
+
+
+SMOOTH = Fit(100, 100, 2.0)
+SHARP = Fit(200, 100, 0.7)  # from long length scales, what is rare and narrow seems noise, and stays so
+
+
 class Regressor:
     """Standardised targets as functions of the same inputs: kernel, noise, and what the data say.
 
@@ -69,8 +90,8 @@ class Regressor:
 
     def __init__(self, learners: int, columns: int, budget: int, sharp: bool = False) -> None:
         batch = (learners,)
-        self.budget, self.sharp = budget, sharp
-        self.bends = SquaredExponential(columns, 2.0, batch_shape=batch)
+        self.budget, self.sharp, self._how = budget, sharp, SHARP if sharp else SMOOTH
+        self.bends = SquaredExponential(columns, self._how.lengthscale, batch_shape=batch)
         self.bends.set_prior("lengthscale", LogNormal(math.log(2.0), 1.0))
         self.bends.set_prior("outputscale", LogNormal(0.0, 2.0))
         slopes = Linear(columns, 0.4, 0.4, batch_shape=batch)
@@ -93,9 +114,9 @@ class Regressor:
     def _spread(self, inputs: Tensor, targets: Tensor) -> Int[Tensor, "L M 1"]:
         """Data to fit hyper-parameters to."""
         if self.sharp:
-            return self._apart(inputs, targets, FIT_POINTS)
+            return self._apart(inputs, targets, self._how.points)
         steps = inputs.shape[1]
-        spaced = torch.linspace(0, steps - 1, min(FIT_POINTS, steps), device=inputs.device)
+        spaced = torch.linspace(0, steps - 1, min(self._how.points, steps), device=inputs.device)
         return spaced.long().view(1, -1, 1).expand(len(inputs), -1, -1)
 
     def _apart(self, inputs: Tensor, targets: Tensor, count: int) -> Int[Tensor, "L M 1"]:
@@ -122,14 +143,14 @@ class Regressor:
         parameters = [*self.kernel.parameters(), self.log_noise]
         before = [value.detach().clone() for value in parameters]
         self.log_noise.requires_grad_(True)
-        optimiser = torch.optim.Adam(parameters, lr=0.1)
+        optimiser = torch.optim.Adam(parameters, lr=FIT_RATE)
         better = torch.zeros(len(inputs), dtype=torch.bool, device=inputs.device)
         try:
             with torch.no_grad():
                 evidence = self._log_evidence(inputs, targets)
                 for value, first in zip(parameters, self._first, strict=True):
                     value.copy_(first)
-            for _ in range(FIT_STEPS):
+            for _ in range(self._how.steps):
                 optimiser.zero_grad()
                 (-self._log_evidence(inputs, targets).sum()).backward()
                 optimiser.step()
@@ -192,6 +213,7 @@ class TransitionModel:
         index = torch.where(ended, ended.int().argmin(1, keepdim=True), index)
         reward = data.reward.gather(1, index).unsqueeze(-1)
         self._reward_low, self._reward_high = reward.amin(1), reward.amax(1)
+        inputs = self.inputs(data.following, data.action)
         self.reward.solve(inputs.take_along_dim(index.unsqueeze(-1), 1), reward, fit)
 
     def inputs(self, observation: Tensor, action: Tensor) -> Float[Tensor, "L N D"]:
@@ -213,7 +235,8 @@ class TransitionModel:
         beyond = margin * (self._high - self._low)
         following = observation + self.motion.mean(inputs)
         following = torch.clamp(following, self._low - beyond, self._high + beyond)
-        reward = torch.clamp(self.reward.mean(inputs).squeeze(-1), self._reward_low, self._reward_high)
+        reward = self.reward.mean(self.inputs(following, action)).squeeze(-1)
+        reward = torch.clamp(reward, self._reward_low, self._reward_high)
         unsure = self.motion.doubt(inputs) if doubt else torch.zeros_like(reward)
         return Prediction(following, reward, unsure)
 

@@ -154,7 +154,7 @@ def row(record: dict[str, Any]) -> str:
 
 def draw(records: Sequence[dict[str, Any]]) -> Figure:
     """Median return of every lever's learners; all learners of the longest run."""
-    figure = Figure(figsize=(11, 4.5), layout="constrained")
+    figure = Figure(figsize=(12, 5), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     longest = max(records, key=lambda record: record["frames"][-1])
     for place, record in enumerate(record for record in records if record is not longest):
@@ -170,7 +170,8 @@ def draw(records: Sequence[dict[str, Any]]) -> Figure:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25, linewidth=0.5)
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(frameon=False, fontsize="x-small", loc="lower right")
+            below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12), "ncols": 3}
+            axes.legend(frameon=False, fontsize="x-small", **below)
     return figure
 
 

@@ -71,7 +71,7 @@ class GaussianBumps:
         """Covariances with x [*batch, N, D]."""
         x = x.to(self.peak.dtype) - self.centre
         exponent = torch.sub(self.peak, x.square() @ self.weight, alpha=0.5)
-        if x.ndim == self.columns.ndim == 2:
+        if x.ndim == self.columns.ndim == 2:  # in place: a copy costs as much as the product
             exponent.addmm_(x, self.columns)
         elif x.ndim == 3 and x.shape[:-2] == self.columns.shape[:-2]:
             exponent.baddbmm_(x, self.columns)

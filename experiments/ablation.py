@@ -20,7 +20,7 @@ from benchmarks import sample_efficiency, sample_report
 from benchmarks.sample_arms import GOALS, ours
 from benchmarks.timing import machine
 
-PLAN = {"rehearsal": 0, "look_ahead": 0}
+PLAN: dict[str, object] = {"rehearsal": 0, "look_ahead": 0}
 ROWS: dict[str, dict[str, object]] = {
     "all parts": {},
     "no looking ahead": {"look_ahead": 0},

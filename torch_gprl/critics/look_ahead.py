@@ -99,21 +99,22 @@ class LookAhead:
 
 
 @cache
-def variations(count: int, steps: int, columns: int) -> Float[Tensor, "K H A"]:
+def variations(each: int, steps: int, columns: int) -> Float[Tensor, "K H A"]:
     """Smooth deviations from a course, in pairs of both signs, from the widest to the finest.
 
     Args:
-        count: K; an odd one is rounded down.
+        each: K/A, how many for each column of the action; K is rounded down to an even number.
         steps: H.
         columns: A.
     """
+    pairs = each * columns // 2
     draws = torch.randn(
-        count // 2, steps, columns, generator=torch.Generator().manual_seed(SEED), dtype=torch.float64
+        pairs, steps, columns, generator=torch.Generator().manual_seed(SEED), dtype=torch.float64
     )
     smooth = [draws[:, 0]]
     for draw in draws[:, 1:].unbind(1):
         smooth.append(LIKENESS * smooth[-1] + (1 - LIKENESS**2) ** 0.5 * draw)
-    scales = WIDEST * (FINEST / WIDEST) ** torch.linspace(0, 1, count // 2, dtype=torch.float64)
+    scales = WIDEST * (FINEST / WIDEST) ** torch.linspace(0, 1, pairs, dtype=torch.float64)
     deviations = torch.stack(smooth, 1) * scales[:, None, None]
     return torch.cat([deviations, -deviations])
 

@@ -28,7 +28,7 @@ class Planning:
     rehearsal: int = 60  # steps of the imagined walks that improve what is performed; 0: perform the plan
     ascents: int = 12  # gradient steps of a rehearsal
     look_ahead: int = 20  # steps of the courses compared before acting; 0: do not look ahead
-    variations: int = 48  # of the last course, in each comparison
+    variations: int = 48  # of the last course, in each comparison, for each column of the action
 
 
 class Support(NamedTuple):

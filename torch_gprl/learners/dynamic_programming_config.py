@@ -37,7 +37,7 @@ class DynamicProgrammingConfig(PlannedBehaviour):
     growth: float = 0.1  # share by which experience grows between plans
     discount: float = 0.98  # γ per environment step, from 0 to 1, 1 excluded
 
-    model_budget: int = 200  # basis vectors of the model of the steps
+    model_budget: int = 400  # basis vectors of the model of the steps
     support: int = 200  # states whose values are planned
     imagined: int = 300  # imagined states that the support is chosen from, besides visited ones
     sweeps: int = 40  # of value iteration in each plan
@@ -51,7 +51,7 @@ class DynamicProgrammingConfig(PlannedBehaviour):
     rehearsal: int = 60  # steps of the imagined walks that improve what is performed; 0: perform the plan
     ascents: int = 12  # gradient steps of a rehearsal
     look_ahead: int = 20  # steps of the courses compared before acting without exploration; 0: none
-    variations: int = 48  # of the last course, in each comparison
+    variations: int = 48  # of the last course, in each comparison, for each column of the action
 
     optimism: float = 1.0  # exploring hopes for the best seen, and so many ranges of what steps pay more
 

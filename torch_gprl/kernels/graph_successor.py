@@ -10,8 +10,8 @@ one borrows from the vertices near it. That is what finds the side of a ridge on
 hard decision, which one trajectory more or less may turn round. So a committee takes it, each member of which
 lacks a fold of the trajectories (Parmanto, Munro and Doyle, 1996) and looks ahead another time. Where its
 members, or the vertices that they end at, disagree, the variance that the average loses is kept, and so is a
-part of that of the vertices nearest to the input itself: near a ridge the prior stays wide. So it does for
-inputs that lie far from all vertices. Inputs on the graph went where they went.
+part of that of the vertices nearest to the input itself: near a ridge the prior stays wide, and with `unseen`
+far from all vertices too. Inputs on the graph went where they went.
 
 | paper | here | meaning |
 |---|---|---|

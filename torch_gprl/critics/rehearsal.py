@@ -193,7 +193,6 @@ def _filled(rows: Float[Tensor, "L M D"], count: int) -> Float[Tensor, "L C D"]:
 
 
 def spread(visited: Float[Tensor, "L N S"], count: int) -> Float[Tensor, "L M S"]:
-    """So many states, or all if there are fewer, evenly over the time in which they were visited."""
-    steps = visited.shape[1]
-    index = torch.linspace(0, steps - 1, min(count, steps), device=visited.device)
+    """So many states, evenly over the time in which they were visited; some again if there are fewer."""
+    index = torch.linspace(0, visited.shape[1] - 1, count, device=visited.device)
     return visited[:, index.long()]

@@ -6,7 +6,7 @@ from torch_gprl.critics.performance import Imagination, Performance, prepare
 from torch_gprl.critics.rehearsal import SmoothPolicy, Walks
 from torch_gprl.critics.transition_model import Transitions
 
-DISCOUNT, LEARNERS, STEPS, COUNT = 0.9, 3, 10, 60
+DISCOUNT, LEARNERS, STEPS, COUNT = 0.9, 3, 10, 120
 BEST = 1 / (1 - DISCOUNT)  # value of rewards of 1 for ever
 LOW, HIGH = torch.zeros(LEARNERS, dtype=torch.float64), torch.full((LEARNERS,), BEST, dtype=torch.float64)
 
@@ -81,8 +81,9 @@ def test_only_who_has_settled_keeps_a_policy_that_is_as_good_as_the_plan():
 def test_a_settled_policy_that_lasts_in_reality_is_kept_whatever_is_imagined():
     # in imagination the held policy leaves the line, and the plan goes to the best place at once
     for ends, since, paid, settled, kept in (
-        (2, 0, 1.0, True, True),  # 60 steps, twice an end: 20 steps each
-        (3, 0, 1.0, True, False),
+        (1, 0, 1.0, True, True),  # 20 steps, and 80 for an end
+        (2, 0, 1.0, True, False),
+        (1, COUNT - 99, 1.0, True, False),
         (0, COUNT - 2 * STEPS, 1.0, True, True),
         (0, COUNT - 2 * STEPS + 1, 1.0, True, False),  # it was another policy that lasted
         (0, 0, 0.98, True, False),  # there is more to earn

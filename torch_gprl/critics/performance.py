@@ -20,10 +20,10 @@ last:
 Then nothing is gained by exploring. A settled learner performs while it learns, so that its experience
 gathers where it lives, and the model gets right there.
 
-Reality outweighs imagination: a settled learner keeps a policy that does without fault, on average between
-faults, as many real steps as a comparison imagines, whatever the model says of it or promises elsewhere. A
-fault is an end, or a step that is paid less than the most there is. The model errs about what drifts slowly,
-and who holds a pole for hundreds of steps has nothing to gain by a change.
+Reality outweighs imagination: a settled learner keeps a policy, whatever the model says of it or promises
+elsewhere, that has done without fault as many real steps as a comparison imagines; each fault since then must be
+paid with four times as many. A fault is an end, or a step that is paid less than the most there is. The model
+errs about what drifts slowly, and who holds a pole for hundreds of steps has nothing to gain by a change.
 """
 
 from collections.abc import Callable
@@ -39,6 +39,7 @@ from torch_gprl.critics.transition_model import Transitions
 
 WALKS, TRIALS = 16, 8  # imagined walks: to rehearse, and to compare
 LONGER = 2  # times as many steps as a rehearsal: a comparison
+FAULT = 4  # comparisons' worth of real steps that make up for a fault
 LEAST_LASTING = 0.1  # chance of going on to the end of a walk, of a learner that has settled
 NOTHING = 0.01  # share of the range of values that is not worth exploring for, or a change
 KEPT = ("smooth", "settled", "reached", "since")  # of what is performed, besides the policy
@@ -147,12 +148,12 @@ def prepare(
 
 
 def _proven(imagination: Imagination, last: Performance | None, steps: int) -> Bool[Tensor, " L"]:
-    """Who has settled on a policy that lasts for so many real steps, on average between faults."""
+    """Who has settled on a policy that lasted for so many real steps, and more for each fault."""
     if last is None:
         return torch.zeros_like(imagination.margin, dtype=torch.bool)
     since = last.since.flatten()
     kept = imagination.data.observation.shape[1] - since
-    return (last.smooth & last.settled).flatten() & (kept >= steps * (1 + imagination.faults(since)))
+    return (last.smooth & last.settled).flatten() & (kept >= steps * (1 + FAULT * imagination.faults(since)))
 
 
 def _compared(

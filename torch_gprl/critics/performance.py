@@ -21,9 +21,10 @@ Then nothing is gained by exploring. A settled learner performs while it learns,
 gathers where it lives, and the model gets right there.
 
 Reality outweighs imagination: a settled learner keeps a policy, whatever the model says of it or promises
-elsewhere, that has done without fault as many real steps as a comparison imagines; each fault since then must be
-paid with four times as many. A fault is an end, or a step that is paid less than the most there is. The model
-errs about what drifts slowly, and who holds a pole for hundreds of steps has nothing to gain by a change.
+elsewhere, that has done without fault as many real steps as a comparison imagines; each fault since then
+must be paid with four times as many. A fault is an end, or a step that is paid less than the most there is.
+The model errs about what drifts slowly, and who holds a pole for hundreds of steps has nothing to gain by a
+change.
 """
 
 from collections.abc import Callable

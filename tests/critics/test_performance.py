@@ -27,11 +27,12 @@ def step(states: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, tor
     return following, 1 - following.square().squeeze(-1), end
 
 
-def experience(paid: float, ends: int) -> Transitions:
-    """Visited states, what each step was paid, and so many ends at last."""
+def experience(paid: float, ends: int, first_end: bool = True) -> Transitions:
+    """Visited states, what each step was paid, an end at first, and so many at last."""
     steps = line(COUNT)
     ended = torch.zeros_like(steps[..., 0])
     ended[:, COUNT - ends :] = 1
+    ended[:, 0] = first_end
     return Transitions(steps, torch.zeros_like(steps), torch.full_like(ended, paid), steps, ended)
 
 
@@ -80,17 +81,18 @@ def test_only_who_has_settled_keeps_a_policy_that_is_as_good_as_the_plan():
 
 def test_a_settled_policy_that_lasts_in_reality_is_kept_whatever_is_imagined():
     # in imagination the held policy leaves the line, and the plan goes to the best place at once
-    for ends, since, paid, settled, kept in (
-        (1, 0, 1.0, True, True),  # 20 steps, and 80 for an end
-        (2, 0, 1.0, True, False),
-        (1, COUNT - 99, 1.0, True, False),
-        (0, COUNT - 2 * STEPS, 1.0, True, True),
-        (0, COUNT - 2 * STEPS + 1, 1.0, True, False),  # it was another policy that lasted
-        (0, 0, 0.98, True, False),  # there is more to earn
-        (0, 0, 1.0, False, False),
+    for ends, since, paid, settled, first_end, kept in (
+        (1, 1, 1.0, True, True, True),  # 20 steps, and 80 for an end
+        (2, 1, 1.0, True, True, False),
+        (1, COUNT - 99, 1.0, True, True, False),
+        (0, COUNT - 2 * STEPS, 1.0, True, True, True),
+        (0, COUNT - 2 * STEPS + 1, 1.0, True, True, False),  # it was another policy that lasted
+        (0, 1, 0.98, True, True, False),  # there is more to earn
+        (0, 1, 1.0, False, True, False),
+        (0, 1, 1.0, True, False, False),  # nobody has ever been lost
     ):
         held = performing(3.0, smooth=True, settled=settled, since=since)
-        imagination = imagine(-1.9, data=experience(paid, ends))
+        imagination = imagine(-1.9, data=experience(paid, ends, first_end))
         prepared = prepare(imagination, policy(), held, STEPS, ascents=0)
         assert torch.equal(prepared.action(line(5), torch.zeros_like), held.policy(line(5))) == kept
 

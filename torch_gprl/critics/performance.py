@@ -22,9 +22,9 @@ gathers where it lives, and the model gets right there.
 
 Reality outweighs imagination: a settled learner keeps a policy, whatever the model says of it or promises
 elsewhere, that has done without fault as many real steps as a comparison imagines; each fault since then
-must be paid with four times as many. A fault is an end, or a step that is paid less than the most there is.
-The model errs about what drifts slowly, and who holds a pole for hundreds of steps has nothing to gain by a
-change.
+must be paid with four times as many. A fault is an end, or a step that is paid less than the most there is;
+who has met no end yet has proved nothing, and may not know what there is. The model errs about what drifts
+slowly, and who holds a pole for hundreds of steps has nothing to gain by a change.
 """
 
 from collections.abc import Callable
@@ -154,7 +154,9 @@ def _proven(imagination: Imagination, last: Performance | None, steps: int) -> B
         return torch.zeros_like(imagination.margin, dtype=torch.bool)
     since = last.since.flatten()
     kept = imagination.data.observation.shape[1] - since
-    return (last.smooth & last.settled).flatten() & (kept >= steps * (1 + FAULT * imagination.faults(since)))
+    lasted = kept >= steps * (1 + FAULT * imagination.faults(since))
+    tested = (imagination.data.terminated > 0.5).any(1)
+    return (last.smooth & last.settled).flatten() & lasted & tested
 
 
 def _compared(
